@@ -1,0 +1,40 @@
+"""The agent's seam: it turns windows of experience and a reward into a policy, and never asks where the reward came from."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.networks import Actor
+from pcil.types import Spec, Window
+
+Metrics = dict[str, Float[Array, ""]]
+
+
+@dataclass(frozen=True)
+class Agent(abc.ABC):
+    """Settings of an agent; all that changes is in the state, a pytree that goes in and comes out."""
+
+    @abc.abstractmethod
+    def init(self, spec: Spec, *, key: PRNGKeyArray) -> Any:
+        """The state before the first update."""
+
+    @abc.abstractmethod
+    def update(self, state: Any, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        """One gradient step of every network on one batch; `step` counts agent steps."""
+
+    @abc.abstractmethod
+    def actor(self, state: Any) -> Actor:
+        """The part of the state that acts; it is all that leaves the device between updates."""
+
+    @abc.abstractmethod
+    def embed(self, state: Any, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch features"]:
+        """The features on which imitation rewards are learned; they are not trained by them."""
+
+    @abc.abstractmethod
+    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
+        """An action `[action]` with exploration noise, on the host."""

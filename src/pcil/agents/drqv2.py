@@ -1,0 +1,114 @@
+"""DrQ-v2 on states: DDPG with n-step returns, a twin critic and scheduled exploration (Yarats et al. 2021).
+
+Facts and sources: the authors' drqv2.py; `docs/methods/drqv2.md` lists where we differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.agents.base import Agent, Metrics
+from pcil.losses import n_step_target
+from pcil.networks import Actor, Critic
+from pcil.noise import LinearSchedule, perturb
+from pcil.types import Spec, Window
+
+
+class DrQV2State(eqx.Module):
+    """Networks, the critic's slow copy (trunk included) and the optimiser's moments."""
+
+    actor: Actor
+    critic: Critic
+    critic_target: Critic
+    actor_moments: optax.OptState
+    critic_moments: optax.OptState
+
+
+@dataclass(frozen=True)
+class DrQV2(Agent):
+    """Settings of the agent."""
+
+    batch_size: int = 128
+    """Windows in one update."""
+    n_step: int = 3
+    """Steps of reward before the target bootstraps."""
+    gamma: float = 0.99
+    """Discount for each agent step."""
+    learning_rate: float = 1e-4
+    """Adam's, for actor and critic."""
+    tau: float = 0.01
+    """Share of the critic that moves into its slow copy at each update."""
+    feature_dim: int = 50
+    """Width of the trunk."""
+    hidden: int = 256
+    """Width of the two hidden layers of actor and critic."""
+    noise: LinearSchedule = LinearSchedule()
+    """Standard deviation of the exploration noise over agent steps."""
+    noise_clip: float = 0.3
+    """Bound on the noise of the actions inside the updates; acting has no bound."""
+
+    def init(self, spec: Spec, *, key: PRNGKeyArray) -> DrQV2State:
+        actor_key, critic_key = jax.random.split(key)
+        actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=actor_key)
+        critic = Critic.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=critic_key)
+        target = jax.tree.map(jnp.copy, critic)
+        adam = optax.adam(self.learning_rate)
+        return DrQV2State(actor, critic, target, adam.init(actor), adam.init(critic))
+
+    def critic_loss(
+        self, critic: Critic, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"], target: Float[Array, " batch"]
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """Squared distance of both values to the target, summed over the two, averaged over the batch."""
+        first, second = critic(obs, action)
+        loss = jnp.mean((first - target) ** 2) + jnp.mean((second - target) ** 2)
+        return loss, {"critic_loss": loss, "value": jnp.mean(first), "target": jnp.mean(target)}
+
+    def actor_loss(
+        self, actor: Actor, critic: Critic, obs: Float[Array, "batch obs"], noise: Float[Array, "batch action"]
+    ) -> Float[Array, ""]:
+        """Minus the smaller value of the actor's noisy action (deterministic policy gradient)."""
+        first, second = critic(obs, perturb(actor(obs), noise))
+        return -jnp.mean(jnp.minimum(first, second))
+
+    def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
+        """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`."""
+        obs_n = window.obs[:, -1]
+        first, second = state.critic_target(obs_n, perturb(state.actor(obs_n), noise))
+        return n_step_target(window.reward, window.discount, jnp.minimum(first, second), self.gamma)
+
+    def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
+        obs, action = window.obs[:, 0], window.action[:, 0]
+        adam = optax.adam(self.learning_rate)
+        noise = self.noise(step) * jax.random.normal(key, (2, *action.shape))
+        noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
+
+        target = jax.lax.stop_gradient(self.target(state, window, noise[0]))
+        gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
+        change, critic_moments = adam.update(gradient, state.critic_moments)
+        critic = optax.apply_updates(state.critic, change)
+
+        loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1])
+        change, actor_moments = adam.update(gradient, state.actor_moments)
+        actor = optax.apply_updates(state.actor, change)
+
+        critic_target = optax.incremental_update(critic, state.critic_target, self.tau)
+        metrics |= {"actor_loss": loss}
+        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments), metrics
+
+    def actor(self, state: DrQV2State) -> Actor:
+        return state.actor
+
+    def embed(self, state: DrQV2State, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch features"]:
+        return state.critic.trunk(obs)
+
+    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
+        mean = actor(obs, np)
+        noise = self.noise(step, np) * rng.standard_normal(mean.shape, dtype=np.float32)
+        return perturb(mean, noise, np)

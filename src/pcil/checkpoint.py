@@ -1,0 +1,93 @@
+"""Checkpoints between episodes: arrays by Orbax, counters by JSON, a checksum over both; the two newest are kept."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zlib
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+KEEP = 2
+Arrays = dict[str, np.ndarray]
+
+
+def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) -> None:
+    """Write one checkpoint as `folder/<frames>`: whole, by a rename, or not at all. Older ones than the last two go."""
+    import orbax.checkpoint as ocp
+
+    final, partial = folder / str(frames), folder / f"partial-{frames}"
+    for path in (final, partial):
+        shutil.rmtree(path, ignore_errors=True)
+    partial.mkdir(parents=True)
+    ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
+    meta = {"counters": counters, "checksums": {name: _checksum(array) for name, array in arrays.items()}}
+    text = json.dumps(meta)
+    (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
+    partial.rename(final)
+    for old in _newest_first(folder)[KEEP:]:
+        shutil.rmtree(old)
+
+
+def restore(folder: Path) -> tuple[Arrays | None, dict[str, Any], list[str]]:
+    """The newest checkpoint that is whole: its arrays and counters, and a sentence for each that had to be passed over."""
+    complaints = []
+    for path in _newest_first(folder):
+        try:
+            arrays, counters = _read(path)
+        except Exception as error:  # whatever a torn file makes Orbax raise, the next older checkpoint is the answer
+            complaints.append(f"The checkpoint {path} is damaged ({_first_line(error)}); using the one before it.")
+        else:
+            return arrays, counters, complaints
+    return None, {}, complaints
+
+
+def flatten(name: str, tree: Any) -> Arrays:
+    """The arrays of a pytree by their path, each name beginning with `name`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))
+    return {f"{name}{jax.tree_util.keystr(path)}": np.asarray(leaf) for path, leaf in leaves}
+
+
+def unflatten(name: str, like: Any, arrays: Arrays) -> Any:
+    """`like` with the arrays that `flatten` gave under `name`; a missing one or another shape raises `ValueError`."""
+    array_part, rest = eqx.partition(like, eqx.is_array)
+
+    def take(path: Any, leaf: Any) -> Any:
+        array = arrays[f"{name}{jax.tree_util.keystr(path)}"]
+        if array.shape != leaf.shape or array.dtype != leaf.dtype:
+            raise ValueError(f"{name}{jax.tree_util.keystr(path)} has shape {array.shape}, expected {leaf.shape}")
+        return jax.numpy.asarray(array)
+
+    return eqx.combine(jax.tree_util.tree_map_with_path(take, array_part), rest)
+
+
+def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
+    import orbax.checkpoint as ocp
+
+    crc, text = (path / "meta.json").read_text().splitlines()
+    if zlib.crc32(text.encode()) != int(crc):
+        raise ValueError("the checksum of meta.json is wrong")
+    meta = json.loads(text)
+    arrays = {k: np.asarray(v) for k, v in ocp.PyTreeCheckpointer().restore((path / "arrays").absolute()).items()}
+    if set(arrays) != set(meta["checksums"]):
+        raise ValueError("arrays are missing")
+    for name, expected in meta["checksums"].items():
+        if _checksum(arrays[name]) != expected:
+            raise ValueError(f"the checksum of {name} is wrong")
+    return arrays, meta["counters"]
+
+
+def _newest_first(folder: Path) -> list[Path]:
+    return sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name), reverse=True)
+
+
+def _checksum(array: np.ndarray) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).tobytes() + f"{array.dtype}{array.shape}".encode())
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"[:160]

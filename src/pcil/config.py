@@ -1,0 +1,109 @@
+"""What a run is: a tree of frozen dataclasses, one doc line a field. The command line is made from it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from pcil.agents import Agent, DrQV2
+from pcil.rewards import PCIL, Reward
+from pcil.types import InputError
+
+MACHINE_SETTINGS = ("checkpoint_seconds",)
+"""Settings that change no result, so a run may resume with others."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """What learns: all that is static in the compiled step, so runs that differ in seed or frames share one compilation."""
+
+    agent: Agent
+    reward: Reward
+    label: Literal["sampled", "stored"]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Every setting of a run. Frames are environment control steps: agent steps times the action repeat."""
+
+    task: str
+    """One of the ten tasks (walker_walk), another dm_control suite task, or any Gymnasium id."""
+    method: str = "pcil"
+    """Name of the method; it chooses the reward and its settings."""
+    preset: str = "default"
+    """default: what our measurements favour; paper: the paper's text; released: what the authors' code does."""
+    seed: int = 1
+    """Everything random follows from it."""
+    frames: int = 500_000
+    """Length of the run."""
+    demos: str | None = None
+    """A shipped task, the folder of a Minari dataset or the id of a local one; by default what ships for the task."""
+    num_demos: int | None = None
+    """Use only the first so many demonstrations."""
+    label: Literal["sampled", "stored"] = "sampled"
+    """When a step gets its learned reward: each time it is sampled (never stale), or once, when its episode is stored."""
+    agent: Agent = field(default_factory=DrQV2)
+    """The agent."""
+    reward: Reward = field(default_factory=PCIL)
+    """The reward."""
+    seed_frames: int = 2000
+    """Frames before the first update."""
+    random_frames: int = 2000
+    """Frames of uniformly random actions at the start."""
+    update_every: int = 2
+    """Agent steps for each update."""
+    replay_steps: int = 500_000
+    """Agent steps that the replay holds."""
+    evaluate_every: int = 20_000
+    """Frames from one evaluation to the next."""
+    evaluate_episodes: int = 10
+    """Episodes of an evaluation."""
+    checkpoint_seconds: float = 120.0
+    """Least time from one checkpoint to the next; a checkpoint is written between episodes, and when the run stops."""
+
+    def __post_init__(self) -> None:
+        if self.label == "sampled" and self.reward.scope == "episode":
+            raise InputError(
+                f"{type(self.reward).__name__} needs whole episodes in order and can't label sampled steps; use --label stored."
+            )
+        if self.frames <= self.seed_frames:
+            raise InputError(
+                f"A run of {self.frames} frames never leaves the {self.seed_frames} frames before the first update; "
+                f"give --frames more than {self.seed_frames}."
+            )
+        if self.reward.batch_size > self.agent.batch_size:
+            raise InputError(
+                f"The reward's batch of {self.reward.batch_size} agent steps is taken from the agent's batch, which has "
+                f"{self.agent.batch_size}; make reward.batch_size at most agent.batch_size."
+            )
+        for name in ("update_every", "evaluate_every", "evaluate_episodes", "replay_steps"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
+        if not 0 <= self.seed < 2**31:
+            raise InputError(f"The seed is {self.seed}; it must be from 0 to 2147483647.")
+
+    @property
+    def learner(self) -> Method:
+        """The part of the settings that is compiled."""
+        return Method(self.agent, self.reward, self.label)
+
+    def to_json(self) -> dict[str, Any]:
+        """Every setting, nested; agent and reward say their class."""
+        tree = dataclasses.asdict(self)
+        for name in ("agent", "reward"):
+            kind = type(getattr(self, name))
+            tree[name] = {"class": f"{kind.__module__}:{kind.__qualname__}", **tree[name]}
+        return tree
+
+
+def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
+    """What differs between two runs' settings, such as "agent.gamma was 0.99, now 0.9"; machine settings don't count."""
+    found = []
+    for name in dict.fromkeys([*old, *new]):
+        before, after = old.get(name), new.get(name)
+        if isinstance(before, dict) and isinstance(after, dict):
+            found += differences(before, after, f"{prefix}{name}.")
+        elif before != after and name not in MACHINE_SETTINGS:
+            found.append(f"{prefix}{name} was {before}, now {after}")
+    return found

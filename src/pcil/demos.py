@@ -1,0 +1,370 @@
+"""Demonstrations: read, checked, recorded and written as Minari datasets (HDF5 + JSON). Nothing is ever downloaded."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.wrappers import FlattenObservation, RescaleAction
+from jaxtyping import Float
+
+from pcil import seeds
+from pcil.types import Episode, InputError, Spec
+
+SHIPPED = Path(__file__).parent / "data" / "demos"  # a Minari root, so that plain Minari can load what ships
+ACTION_TOLERANCE = 1e-6  # how far rounding may carry an action out of [-1, 1]
+ATTEMPTS_PER_EPISODE = 10  # `record` gives up after so many rollouts for each episode that was asked for
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Demonstrations:
+    """Whole episodes of an expert, with flat observations and with actions in [-1, 1].
+
+    `task` is a shipped task's name ("walker_walk") or a Gymnasium id. `info` says where the episodes come from and must
+    be JSON; `shipped` shows its keys `expert` (one line: method, frames, seed), `frames` and `seeds_tried`.
+    """
+
+    task: str
+    episodes: tuple[Episode, ...]
+    info: dict[str, Any]
+
+    @classmethod
+    def load(cls, spec: str | Path) -> Demonstrations:
+        """The demonstrations that `spec` names; `InputError` says in one sentence what is wrong with it or with them.
+
+        `spec` is, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the path of a
+        Minari dataset folder (or of the `data` folder in it), the id of a dataset in the user's local Minari root.
+        Dict observations are flattened as Gymnasium's FlattenObservation does it, and actions are brought from the
+        dataset's Box to [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes `info`.
+        """
+        data = _find(spec)
+        metadata, episodes = _read(data)
+        _check(episodes, str(data))
+        environment = json.loads(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", str(spec))
+        own = {"task": _task(environment), "info": metadata} | metadata.get("pcil", {})
+        return cls(own["task"], tuple(episodes), own["info"])
+
+    @property
+    def num_steps(self) -> int:
+        """Agent steps in all episodes together; each is one row of `obs` and `action`."""
+        return sum(len(episode) for episode in self.episodes)
+
+    @property
+    def returns(self) -> Float[np.ndarray, " episodes"]:
+        """The undiscounted sum of the environment's rewards, for each episode, in float64."""
+        return np.array([episode.total_reward for episode in self.episodes], np.float64)
+
+    @property
+    def return_mean(self) -> float:
+        """The mean return of an episode."""
+        return float(self.returns.mean())
+
+    @property
+    def return_std(self) -> float:
+        """The population standard deviation of the returns (divided by the number of episodes; 0 for one episode)."""
+        return float(self.returns.std())
+
+    @property
+    def obs(self) -> Float[np.ndarray, "N O"]:
+        """All states in which an action was taken, in a new array: each episode's final observation is left out."""
+        return np.concatenate([episode.obs[:-1] for episode in self.episodes])
+
+    @property
+    def action(self) -> Float[np.ndarray, "N A"]:
+        """The actions taken in `obs`, row by row, in a new array."""
+        return np.concatenate([episode.action for episode in self.episodes])
+
+    @property
+    def hash(self) -> str:
+        """Hexadecimal SHA-256 of the observations, actions, rewards and terminations; saving and loading keep it."""
+        digest = hashlib.sha256()
+        for episode in self.episodes:
+            for array, dtype in ((episode.obs, "<f4"), (episode.action, "<f4"), (episode.reward, "<f8")):
+                digest.update(f"{array.shape} {bool(episode.terminated)}".encode() + array.astype(dtype).tobytes())
+        return digest.hexdigest()
+
+    def validate(self, spec: Spec | None) -> Demonstrations:
+        """These demonstrations, if something can be learned from them in the environment of `spec`.
+
+        `InputError` refuses no episodes, values that are not finite, actions out of [-1, 1] and shapes that differ from
+        the environment's (from the first episode's, if `spec` is None).
+        """
+        _check(self.episodes, f"the demonstrations of {self.task}", spec)
+        return self
+
+    def take(self, n: int | None) -> Demonstrations:
+        """The first `n` episodes; all of them if `n` is None. `InputError` if there are not as many, or `n` < 1."""
+        available = len(self.episodes)
+        if n is not None and not 1 <= n <= available:
+            raise InputError(f"{n} demonstrations of {self.task} were asked for, but 1 to {available} can be had.")
+        return dataclasses.replace(self, episodes=self.episodes[:n])
+
+    def save(self, path: str | Path, *, dataset_id: str | None = None) -> Path:
+        """Write a Minari dataset folder at `path`, whole or not at all, and return its absolute path.
+
+        Observations and actions are written as float32, rewards as they are. Without `dataset_id`, the id is the path
+        below the Minari root, or is made of the folder's name. The environment's specification goes along if
+        Gymnasium has it registered. `InputError` if something is there already or the place can not be written.
+        """
+        self.validate(None)
+        folder = Path(path).expanduser().resolve()
+        dataset_id = _dataset_id(folder, dataset_id)
+        try:
+            if folder.exists() and (folder.is_file() or any(folder.iterdir())):
+                raise InputError(f"{folder} exists already: give a path where there is nothing yet.")
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
+                unfinished = Path(scratch) / "dataset"
+                self._write(unfinished / "data", dataset_id)
+                unfinished.rename(folder)
+        except (OSError, TypeError) as error:
+            wanted = "the place must be writable and the info must be JSON"
+            raise InputError(f"{folder} can not be written ({_reason(error)}): {wanted}.") from error
+        return folder
+
+    def _write(self, data: Path, dataset_id: str) -> None:
+        """Write `metadata.json` and `main_data.hdf5` into the new folder `data`, by Minari's own hand."""
+        import minari
+        from minari.dataset.minari_storage import MinariStorage
+
+        data.mkdir(parents=True)
+        box, first = gymnasium.spaces.Box, self.episodes[0]
+        observation_space = box(-np.inf, np.inf, first.obs.shape[1:], np.float32)
+        action_space = box(-1.0, 1.0, first.action.shape[1:], np.float32)
+        storage = MinariStorage.new(data, observation_space, action_space, _env_spec(self.task))
+        known = {"dataset_id": dataset_id, "minari_version": minari.__version__}
+        described = {"description": f"Demonstrations of {self.task} by {self.info.get('expert', 'an unknown expert')}."}
+        storage.update_metadata(known | described | {"pcil": {"task": self.task, "info": self.info}})
+        for episode in self.episodes:
+            last = np.arange(len(episode)) == len(episode) - 1
+            buffer = minari.data_collector.EpisodeBuffer(
+                seed=episode.seed,
+                observations=episode.obs.astype(np.float32),
+                actions=episode.action.astype(np.float32),
+                rewards=episode.reward,
+                terminations=last & episode.terminated,
+                truncations=last & (not episode.terminated),
+            )
+            storage.update_episodes([buffer])
+
+
+def record(
+    policy: Callable[[np.ndarray], Any],
+    env: gymnasium.Env,
+    episodes: int,
+    *,
+    task: str,
+    seed: int,
+    minimum_return: float | None = None,
+    info: dict[str, Any],
+) -> Demonstrations:
+    """`episodes` episodes of `policy`, a function of the arguments alone: attempt k is reset with the k-th seed.
+
+    `policy` maps an observation [O] in float32 to an action [A] in [-1, 1]. Episodes that return less than
+    `minimum_return` are dropped and tried again with the next seed. `info` is kept; `record_*` keys are added to it.
+    """
+    if episodes < 1:
+        raise InputError(f"{episodes} episodes were asked for, but at least 1 must be recorded.")
+    kept: list[Episode] = []
+    for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
+        episode = _rollout(policy, env, seeds.episode_seed(seed, seeds.Stream.RECORD, attempt))
+        if minimum_return is None or episode.total_reward >= minimum_return:
+            kept.append(episode)
+        if len(kept) == episodes:
+            made = {"record_seed": seed, "record_attempts": attempt + 1, "record_minimum_return": minimum_return}
+            return Demonstrations(task, tuple(kept), info | made).validate(None)
+    raise InputError(
+        f"Only {len(kept)} of {limit} episodes of {task} returned at least {minimum_return}, but {episodes} were "
+        f"asked for: lower the minimum return or record a better policy."
+    )
+
+
+def _rollout(policy: Callable[[np.ndarray], Any], env: gymnasium.Env, seed: int) -> Episode:
+    observations, actions, rewards = [np.array(env.reset(seed=seed)[0], np.float32)], [], []
+    terminated = truncated = False
+    while not (terminated or truncated):
+        actions.append(np.array(policy(observations[-1]), np.float32))
+        obs, reward, terminated, truncated, _ = env.step(actions[-1])
+        observations.append(np.array(obs, np.float32))  # a copy: the environment may reuse its buffer
+        rewards.append(float(reward))
+    return Episode(np.stack(observations), np.stack(actions), np.array(rewards), bool(terminated), seed)
+
+
+def shipped_tasks() -> list[str]:
+    """The names of the tasks whose demonstrations lie in the package."""
+    return sorted(path.parents[2].name for path in SHIPPED.glob("dmc/*/expert-v0/data/metadata.json"))
+
+
+def shipped() -> list[dict[str, Any]]:
+    """One row for each shipped dataset, read from the data itself except for what only `info` knows (else None)."""
+    return [
+        {
+            "task": demos.task,
+            "observation_dim": demos.obs.shape[1],
+            "action_dim": demos.action.shape[1],
+            "episodes": len(demos.episodes),
+            "steps": demos.num_steps,
+            "return_mean": demos.return_mean,
+            "return_std": demos.return_std,
+            **{key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")},
+            "hash": demos.hash,
+        }
+        for demos in map(Demonstrations.load, shipped_tasks())
+    ]
+
+
+def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -> None:
+    """Refuse what `Demonstrations.validate` says, naming `source`."""
+    if not episodes:
+        raise InputError(f"There are no episodes in {source}, but at least one is needed.")
+    first = episodes[0]
+    obs_dim, action_dim = (spec.obs_dim, spec.action_dim) if spec else (first.obs.shape[-1], first.action.shape[-1])
+    for index, episode in enumerate(episodes):
+        where, steps = f"Episode {index} of {source}", len(episode)
+        shapes = {"obs": (steps + 1, obs_dim), "action": (steps, action_dim), "reward": (steps,)}
+        for name, shape in shapes.items():
+            array = getattr(episode, name)
+            if array.shape != shape:
+                whose = "in this environment" if spec else "after the first episode"
+                raise InputError(f"{where} has {name} of shape {array.shape}, but {whose} it must be {shape}.")
+            if not np.isfinite(array).all():
+                raise InputError(f"{where} has NaN or infinite values in {name}, but all must be finite.")
+        low, high = float(episode.action.min()), float(episode.action.max())
+        if max(-low, high) > 1 + ACTION_TOLERANCE:
+            raise InputError(
+                f"{where} has actions from {low:.7g} to {high:.7g}, but they must lie in [-1, 1] (a dataset's own "
+                f"action bounds are brought there first)."
+            )
+
+
+def _find(spec: str | Path) -> Path:
+    """The folder with the `metadata.json` of the dataset that `spec` names."""
+    names, places = shipped_tasks(), [Path(spec).expanduser(), _minari_root() / spec]
+    if isinstance(spec, str) and _task(spec) in names:
+        places = [SHIPPED / "dmc" / _task(spec) / "expert-v0"]
+    for place in places:
+        for data in (place / "data", place):
+            if (data / "metadata.json").is_file():
+                return data
+    if there := [place for place in places if place.exists()]:
+        raise InputError(f"{there[0]} is no Minari dataset folder: it must hold data/metadata.json, but does not.")
+    raise InputError(
+        f"There are no demonstrations {str(spec)!r}: give a shipped task ({', '.join(names) or 'none ship'}), the "
+        f"path of a Minari dataset folder, or the id of a dataset below {places[1]}."
+    )
+
+
+def _read(data: Path) -> tuple[dict[str, Any], list[Episode]]:
+    """Metadata and episodes of a dataset, in any format that Minari can read here."""
+    from minari.dataset.minari_storage import MinariStorage
+
+    where, episodes = str(data / "metadata.json"), []
+    try:
+        metadata = json.loads((data / "metadata.json").read_bytes())
+        count, steps = metadata["total_episodes"], metadata["total_steps"]
+        # Were the spaces missing, Minari would make the environment, and so run whatever code the file names.
+        spaces = [json.loads(metadata[key]) for key in ("observation_space", "action_space")]
+        where, indices = str(data), range(count)
+        if metadata["data_format"] == "hdf5":
+            _check_hdf5(data / "main_data.hdf5", count)
+        storage = MinariStorage.read(data)
+        for raw, known in zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True):
+            where = f"Episode {len(episodes)} of {data}"
+            episodes.append(_episode(raw, known.get("seed"), *spaces))
+        where = str(data)
+        if sum(map(len, episodes)) != steps:
+            raise ValueError(f"metadata.json promises {steps} steps, but there are {sum(map(len, episodes))}")
+    except Exception as error:  # a damaged file may make json, h5py and Minari raise anything
+        wanted = "it must be a whole dataset as Minari writes it"
+        raise InputError(f"{where} can not be read ({_reason(error)}): {wanted}.") from error
+    return metadata, episodes
+
+
+def _check_hdf5(file: Path, count: int) -> None:
+    """Refuse, before Minari reads it, a file that is none, or that holds more or fewer than `count` episodes."""
+    import h5py
+
+    if count and not h5py.is_hdf5(file):
+        raise ValueError(f"{file.name} is {'not an HDF5 file' if file.exists() else 'missing'}")
+    if count:
+        with h5py.File(file) as groups:
+            if len(groups) != count:
+                raise ValueError(f"metadata.json promises {count} episodes, but {file.name} holds {len(groups)}")
+
+
+def _episode(raw: dict[str, Any], seed: int | None, observation_space: dict, action_space: dict) -> Episode:
+    """One episode out of Minari's arrays; the spaces are those of the metadata, in JSON. `ValueError` if ill-formed."""
+    low, high = (np.ravel(action_space.get(bound, np.nan)).astype(np.float64) for bound in ("low", "high"))
+    if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+        raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
+    obs, stored = _flat(raw["observations"], observation_space), _flat(raw["actions"], action_space)
+    action = (stored - (high + low) / 2) / ((high - low) / 2)
+    reward, *flags = (np.asarray(raw[key]) for key in ("rewards", "terminations", "truncations"))
+    steps, lengths = len(action), (len(obs), len(reward), *map(len, flags))
+    if steps == 0 or lengths != (steps + 1, steps, steps, steps):
+        raise ValueError(
+            f"{steps} actions need {steps + 1} observations and {steps} rewards, terminations and truncations, "
+            f"at least 1 of each, but there are {lengths}"
+        )
+    reward = reward.astype(np.float32 if reward.dtype == np.float32 else np.float64)
+    with np.errstate(over="ignore"):  # what is too large becomes infinite here, and is refused as such
+        return Episode(obs.astype(np.float32), action.astype(np.float32), reward, bool(flags[0][-1]), seed)
+
+
+def _flat(values: Any, space: dict[str, Any]) -> Float[np.ndarray, "T dim"]:
+    """The values of `space` as rows of numbers, the parts of a Dict in the order that the environment gave them."""
+    if space["type"] == "Dict":
+        return np.concatenate([_flat(values[key], part) for key, part in space["subspaces"].items()], axis=1)
+    if space["type"] != "Box":
+        raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box")
+    if values.dtype.kind not in "fiub" or list(values.shape[1:]) != space["shape"]:
+        raise ValueError(f"{values.dtype} {values.shape[1:]} is stored where the space has numbers {space['shape']}")
+    return values.reshape(len(values), -1 if len(values) else 0).astype(np.float64)
+
+
+def _task(name: str) -> str:
+    """The task that "dmc/<task>-v0" (an environment) or "dmc/<task>/expert-v0" (a dataset) names; else `name`."""
+    match = re.fullmatch(r"dmc/(\w+?)(/expert)?-v0", name)
+    return match[1] if match else name
+
+
+def _env_spec(task: str) -> EnvSpec | None:
+    """What Gymnasium has registered for `task`, with the wrappers that make it flat and its actions [-1, 1]."""
+    known = [gymnasium.registry[name] for name in (f"dmc/{task}-v0", task) if name in gymnasium.registry]
+    if not known or not isinstance(known[0].entry_point, str):
+        return None
+    wrappers = (FlattenObservation.wrapper_spec(), RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0))
+    return known[0] if known[0].namespace == "dmc" else dataclasses.replace(known[0], additional_wrappers=wrappers)
+
+
+def _minari_root() -> Path:
+    """Where Minari looks for datasets; unlike Minari's own function, this does not make the folder."""
+    return Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser()
+
+
+def _dataset_id(folder: Path, wanted: str | None) -> str:
+    """`wanted`, or the path below a Minari root, or the folder's name made into an id."""
+    from minari.dataset.minari_dataset import DATASET_ID_RE
+
+    roots = [root.resolve() for root in (SHIPPED, _minari_root()) if folder.is_relative_to(root.resolve())]
+    name = re.sub(r"[^-\w]+|(-v\d+)$", "_", folder.name)  # noqa
+    dataset_id = wanted or (folder.relative_to(roots[0]).as_posix() if roots else name)
+    match = DATASET_ID_RE.fullmatch(dataset_id)
+    if match is None or match["version"] is None:
+        raise InputError(f"{dataset_id!r} is no Minari dataset id: it must look like namespace/name-v0.")
+    return dataset_id
+
+
+def _reason(error: Exception) -> str:
+    """What a library said, without line breaks and full stops, to go into a sentence of ours."""
+    text = str(error.args[0] if isinstance(error, KeyError) else error).strip() or type(error).__name__
+    return re.sub(r"[.!?]?\s*\n.*|[.!?]$", "", text, flags=re.DOTALL).replace(". ", "; ")

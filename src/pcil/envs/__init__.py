@@ -1,0 +1,145 @@
+"""Environments by name: `make("walker_walk")` or any Gymnasium id, always with flat float32 boxes."""
+
+from __future__ import annotations
+
+import difflib
+from typing import NoReturn
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces, wrappers
+
+from pcil.types import InputError, Spec
+
+__all__ = ["TASKS", "make", "register", "spec", "task_name"]
+
+TASKS = (
+    "finger_spin",
+    "hopper_stand",
+    "pendulum_swingup",
+    "walker_stand",
+    "walker_walk",
+    "acrobot_swingup",
+    "cheetah_run",
+    "hopper_hop",
+    "quadruped_run",
+    "walker_run",
+)
+"""The ten tasks of the paper's Table 1, all from DeepMind Control."""
+
+_TOYS = {
+    "toy/point_mass-v0": "PointMass",
+    "toy/probe_1-v0": "ConstantReward",
+    "toy/probe_2-v0": "ObservedReward",
+    "toy/probe_3-v0": "DelayedReward",
+    "toy/probe_4-v0": "ActionReward",
+    "toy/probe_5-v0": "ObservedActionReward",
+}
+
+
+def register() -> None:
+    """Registers `dmc/<task>-v0` for the ten tasks and the toy environments with Gymnasium; again is harmless."""
+    for task in TASKS:
+        _register(dmc_id(task), "pcil.envs.dmc:DMCEnv", task=task)
+    for toy_id, name in _TOYS.items():
+        _register(toy_id, f"pcil.envs.toy:{name}")
+
+
+def _register(env_id: str, entry_point: str, **kwargs: str) -> None:
+    """Registers one environment so that `gymnasium.make` wraps nothing around it."""
+    if env_id not in gymnasium.registry:
+        gymnasium.register(env_id, entry_point, kwargs=kwargs, disable_env_checker=True, order_enforce=False)
+
+
+def dmc_id(task: str) -> str:
+    """The Gymnasium id of a task of DeepMind Control."""
+    return f"dmc/{task}-v0"
+
+
+def task_name(task: str) -> str:
+    """The short name under which results are kept: "walker_walk" for "dmc/walker_walk-v0", other ids as they are."""
+    return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
+
+
+def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
+    """The environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
+
+    `task` is a task of DeepMind Control's suite ("walker_walk" or "dmc/walker_walk-v0"), one of our toys
+    ("toy/point_mass-v0") or any Gymnasium id whose spaces are boxes; those are flattened and rescaled with Gymnasium's
+    own wrappers.
+    """
+    register()
+    try:
+        env = gymnasium.make(_gymnasium_id(task), render_mode=render_mode, disable_env_checker=True)
+    except gymnasium.error.UnregisteredEnv:
+        _refuse_name(task)
+    except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
+        raise InputError(f"The environment {task!r} needs a package that is not installed: {error}") from error
+    return _flat_actions(_flat_observations(env, task), task)
+
+
+def spec(env: gymnasium.Env) -> Spec:
+    """The sizes of a made environment, and how many control steps (frames) one of its steps takes."""
+    from pcil.envs.dmc import DMCEnv
+
+    inner = env.unwrapped
+    action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
+    return Spec(env.observation_space.shape[0], env.action_space.shape[0], action_repeat)
+
+
+def _gymnasium_id(task: str) -> str:
+    """The registered id for a name; registers a task of the suite that is not among the ten on demand."""
+    name = task_name(task)
+    if dmc_id(name) in gymnasium.registry:
+        return dmc_id(name)
+    if name.isidentifier() and name in _suite_tasks():
+        _register(dmc_id(name), "pcil.envs.dmc:DMCEnv", task=name)
+        return dmc_id(name)
+    return task
+
+
+def _suite_tasks() -> list[str]:
+    """Every task of DeepMind Control's suite by name; imports dm_control, which takes half a second."""
+    from pcil.envs.dmc import import_suite
+
+    return [f"{domain}_{name}" for domain, name in import_suite().ALL_TASKS]
+
+
+def _refuse_name(task: str) -> NoReturn:
+    known = [*TASKS, *gymnasium.registry, *_suite_tasks()]
+    near = difflib.get_close_matches(task, known, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise InputError(
+        f"There is no environment {task!r}{hint}: give one of {', '.join(TASKS)}, another task of DeepMind Control's "
+        "suite, or any Gymnasium id."
+    )
+
+
+def _flat_observations(env: gymnasium.Env, task: str) -> gymnasium.Env:
+    space = env.observation_space
+    boxes = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+    if not boxes or not all(isinstance(box, spaces.Box) for box in boxes):
+        raise InputError(f"The observations of {task!r} must be a Box or a Dict of Boxes; they are {space}.")
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        env = wrappers.FlattenObservation(env)
+    if env.observation_space.dtype != np.float32:
+        env = wrappers.DtypeObservation(env, np.float32)
+    return env
+
+
+def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
+    space = env.action_space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
+        raise InputError(f"The actions of {task!r} must be a flat Box of real numbers; they are {space}.")
+    if not space.is_bounded():
+        raise InputError(f"The actions of {task!r} must have finite bounds; they are {space}.")
+    dtype = space.dtype
+    if np.any(space.low != -1.0) or np.any(space.high != 1.0):
+        env = wrappers.RescaleAction(env, -1.0, 1.0)
+    if dtype != np.float32:
+        box = spaces.Box(-1.0, 1.0, space.shape, np.float32)
+        env = wrappers.TransformAction(env, lambda action: np.asarray(action, dtype), box)
+    return env
+
+
+register()

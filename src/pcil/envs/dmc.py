@@ -1,0 +1,273 @@
+"""Any task of DeepMind Control's suite as a `gymnasium.Env`, bit for bit equal to `dm_control` and much faster to step.
+
+Physics and task are dm_control's own objects. What is ours is the loop around them: dm_control's order of operations
+without its time steps, named indexing and dictionaries, and the observation built once for each agent step.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pcil.envs.views import Views, views_for
+from pcil.types import InputError
+
+_RENDERERS = {
+    "egl": ("dm_control._render.pyopengl.egl_renderer", "EGLContext"),
+    "osmesa": ("dm_control._render.pyopengl.osmesa_renderer", "OSMesaContext"),
+    "glfw": ("dm_control._render.glfw_renderer", "GLFWContext"),
+}
+
+
+class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One task of the suite with flat float32 observations and actions in [-1, 1].
+
+    The observation holds dm_control's entries, concatenated in dm_control's order. An action is held for
+    `action_repeat` control steps (frames) and their rewards are summed in float64; an episode that ends earlier ends
+    there. A time limit truncates; only a task that ends with discount 0 terminates. `info["frames"]` counts the control
+    steps of the episode.
+
+    Nothing here catches or hides a `dm_control.rl.control.PhysicsError`: a diverged simulation stops the run.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        action_repeat: int = 2,
+        render_mode: str | None = None,
+        width: int = 320,
+        height: int = 240,
+        camera_id: int | str = 0,
+    ) -> None:
+        if action_repeat < 1:
+            raise InputError(f"action_repeat is a number of control steps of at least 1; got {action_repeat}.")
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f'render_mode is None or "rgb_array" for DeepMind Control; got {render_mode!r}.')
+        suite = import_suite()
+        if render_mode is not None:
+            enable_rendering()
+        self.name = task
+        self._domain, self._task = split_name(task, suite.ALL_TASKS)
+        self.action_repeat = action_repeat
+        self.render_mode = render_mode
+        self._camera = {"height": height, "width": width, "camera_id": camera_id}
+        self._random_model = False
+        random = np.random.RandomState(0)
+        self._load(random)
+        # lqr draws its springs while it is loaded, so that there each episode needs a model of its own.
+        self._random_model = random.bytes(16) != np.random.RandomState(0).bytes(16)
+        self._define_spaces()
+        self._frames, self._over = 0, True
+
+    @property
+    def physics(self) -> Any:
+        """The `dm_control.mujoco.Physics` that is stepped: states, bodies, cameras."""
+        return self._env.physics
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts the episode that a fresh `suite.load(..., task_kwargs={"random": seed})` would start with.
+
+        Without a seed, one is drawn from `np_random`.
+        """
+        del options
+        super().reset(seed=seed)
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        if self._random_model:
+            self._load(np.random.RandomState(seed))
+        else:
+            self._env.task.random.seed(seed)
+        with self.physics.reset_context():
+            self._env.task.initialize_episode(self.physics)
+        self._advance = advance_function(self.physics, self._env.task, self.num_substeps)
+        self._frames, self._over = 0, False
+        return self._observation(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Holds one action for `action_repeat` control steps or until the episode ends."""
+        if self._over:
+            raise gymnasium.error.ResetNeeded("The episode is over or never began: call reset() before step().")
+        control = self.control_signal(action)
+        reward, terminated = 0.0, False
+        for _ in range(self.action_repeat):
+            self._advance(control)
+            reward += self._reward()
+            self._frames += 1
+            if self._frames >= self._frame_limit:
+                self._over = True
+            elif self._termination is not None and (discount := self._termination(self.physics)) is not None:
+                self._over, terminated = True, discount == 0.0
+            if self._over:
+                break
+        return self._observation(), reward, terminated, self._over and not terminated, {"frames": self._frames}
+
+    def control_signal(self, action: np.ndarray) -> np.ndarray:
+        """The task's control signal for an action in [-1, 1], in float64."""
+        action = checked_action(action, self._action_low.shape)
+        return self._action_low + self._action_scale * (action + 1.0) if self._rescale else action
+
+    def render(self) -> np.ndarray | None:
+        """What the camera sees now, `[height, width, 3]` uint8."""
+        return None if self.render_mode is None else self.physics.render(**self._camera)
+
+    def close(self) -> None:
+        """Frees the rendering contexts; the simulation needs no closing."""
+        if self.render_mode is not None:
+            self.physics.free()
+
+    def _load(self, random: np.random.RandomState) -> None:
+        """Loads model and task and prepares what a step calls."""
+        from dm_control.rl import control
+
+        self._env = env = import_suite().load(self._domain, self._task, task_kwargs={"random": random})
+        self.num_substeps: int = env._n_sub_steps  # dm_control shows this and the limit nowhere else
+        self._frame_limit: float = env._step_limit
+        self._fill_observation, self._reward = (views_for(self.name) or generic_views)(env)
+        inherited = type(env.task).get_termination is control.Task.get_termination  # which is: never
+        self._termination = None if inherited else env.task.get_termination
+
+    def _define_spaces(self) -> None:
+        self._obs_dim = sum(int(np.prod(entry.shape)) for entry in self._env.observation_spec().values())
+        bounds = self._env.action_spec()
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._obs_dim,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, bounds.shape, np.float32)
+        # As dm_control's action_scale.Wrapper(env, -1, 1) has it; where the bounds are [-1, 1] nothing is to be scaled.
+        self._action_low, self._action_scale = bounds.minimum, (bounds.maximum - bounds.minimum) / 2.0
+        self._rescale = bool(np.any(bounds.minimum != -1.0) or np.any(bounds.maximum != 1.0))
+        fps = 1.0 / (self._env.control_timestep() * self.action_repeat)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(fps)}
+
+    def _observation(self) -> np.ndarray:
+        row = np.empty(self._obs_dim, np.float32)
+        self._fill_observation(row)
+        return row
+
+
+def checked_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The action in float64, refused if it has another shape or an entry that is NaN or outside [-1, 1]."""
+    action = np.asarray(action, dtype=np.float64)
+    if action.shape != shape:
+        raise ValueError(f"An action of shape {shape} was expected; got shape {action.shape}.")
+    for value in action.tolist():  # for a few numbers faster than NumPy; a NaN fails the comparison
+        if not -1.0 <= value <= 1.0:
+            raise ValueError(f"Every entry of an action must lie in [-1, 1]; got {value!r}.")
+    return action
+
+
+def import_suite() -> ModuleType:
+    """`dm_control.suite`, imported so that a machine without OpenGL is no hindrance.
+
+    Unless `MUJOCO_GL` says otherwise, dm_control looks for a window system while it is imported. We keep it from that
+    for the length of the import; `enable_rendering` brings OpenGL in when someone asks for pictures.
+    """
+    chosen = os.environ.setdefault("MUJOCO_GL", "disabled") if "dm_control._render" not in sys.modules else None
+    try:
+        return importlib.import_module("dm_control.suite")
+    finally:
+        if chosen == "disabled":
+            del os.environ["MUJOCO_GL"]
+
+
+def enable_rendering() -> None:
+    """Gives dm_control a renderer that needs no display: the one that `MUJOCO_GL` names, else EGL, else OSMesa."""
+    render = importlib.import_module("dm_control._render")
+    name = os.environ.get("MUJOCO_GL", "").lower()
+    if not name:
+        name = "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
+    if name == render.BACKEND:
+        return
+    try:
+        module, context = _RENDERERS[name]
+        render.Renderer, render.BACKEND = getattr(importlib.import_module(module), context), name
+    except (KeyError, ImportError, AttributeError, OSError, RuntimeError) as error:
+        raise InputError(
+            f"Rendering needs OpenGL and {name!r} does not work here: install EGL (apt install libegl1) and set the "
+            "environment variable MUJOCO_GL=egl, or OSMesa (apt install libosmesa6) and MUJOCO_GL=osmesa."
+        ) from error
+
+
+def split_name(task: str, all_tasks: tuple[tuple[str, str], ...]) -> tuple[str, str]:
+    """`("ball_in_cup", "catch")` for "ball_in_cup_catch": names of domains and of tasks may hold underscores."""
+    for domain, name in all_tasks:
+        if task == f"{domain}_{name}":
+            return domain, name
+    raise InputError(f"DeepMind Control has no task {task!r}; a task is a domain and a task such as walker_walk.")
+
+
+def advance_function(physics: Any, task: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
+    """One control step: set the control signal, then the substeps in dm_control's order.
+
+    Made anew for each episode, whose beginning tells which of MuJoCo's warnings are new. A task that does more than that in a step is left to its own methods.
+    """
+    from dm_control.mujoco import engine
+    from dm_control.suite import base
+
+    plain = (
+        type(task).before_step is base.Task.before_step
+        and type(task).after_step is base.Task.after_step  # recolours bodies if `visualize_reward`, which is off
+        and type(physics).step is engine.Physics.step
+        and type(physics).set_control is engine.Physics.set_control
+        and physics.legacy_step
+    )
+    if plain:
+        return _plain_advance(physics, num_substeps)
+
+    def advance(control: np.ndarray) -> None:
+        task.before_step(control, physics)
+        physics.step(num_substeps)
+        task.after_step(physics)
+
+    return advance
+
+
+def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
+    import mujoco
+
+    model, data = physics.model.ptr, physics.data.ptr
+    control_signal, warnings, before = data.ctrl, data.warning.number, data.warning.number.tobytes()
+    runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    mj_step, mj_step1, mj_step2 = mujoco.mj_step, mujoco.mj_step1, mujoco.mj_step2
+
+    def advance(control: np.ndarray) -> None:
+        control_signal[:] = control
+        if runge_kutta:
+            mj_step(model, data, num_substeps)
+        else:
+            mj_step2(model, data)
+            if num_substeps > 1:
+                mj_step(model, data, num_substeps - 1)
+        mj_step1(model, data)  # so that positions and velocities are those of the new state
+        if warnings.tobytes() != before:
+            _raise_physics_error(warnings > np.frombuffer(before, warnings.dtype))
+
+    return advance
+
+
+def _raise_physics_error(raised: np.ndarray) -> None:
+    """Raises dm_control's error if one of MuJoCo's warnings came up."""
+    import mujoco
+    from dm_control.rl import control
+
+    if names := [name for name, new in zip(mujoco.mjtWarning.__members__, raised, strict=False) if new]:
+        raise control.PhysicsError(f"Physics state is invalid. Warning(s) raised: {', '.join(names)}")
+
+
+def generic_views(env: Any) -> Views:
+    """Observation and reward through the task's own methods, for any task."""
+    physics, task = env.physics, env.task
+
+    def fill_observation(row: np.ndarray) -> None:
+        entries = task.get_observation(physics).values()
+        np.concatenate([np.ravel(entry) for entry in entries], out=row, casting="same_kind")
+
+    def reward() -> float:
+        return float(task.get_reward(physics))
+
+    return fill_observation, reward

@@ -1,0 +1,74 @@
+"""What an environment costs beside its bare physics, in one process so that the ratio survives a busy core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from statistics import median
+
+import numpy as np
+
+from pcil.envs import make
+from pcil.envs.dmc import DMCEnv
+from pcil.types import InputError
+
+_BLOCK = 50
+"""Agent steps timed at once: env and physics take turns, so that both see the same disturbances."""
+
+
+def measure_env(task: str, episodes: int = 3) -> dict[str, float]:
+    """Microseconds per agent step of a DeepMind Control task: `env_step_us`, `physics_us`, and `ratio` of the two.
+
+    The physics is MuJoCo's step functions alone, on the same model and along the very same states: its own copy of the
+    simulation gets the same random actions. Medians over blocks; `ratio` is the median of the ratios of neighbours.
+    """
+    env = make(task).unwrapped
+    if not isinstance(env, DMCEnv):
+        raise InputError(f"Only tasks of DeepMind Control have bare physics to compare with; got {task!r}.")
+    env_us, physics_us = [], []
+    for episode in range(episodes):
+        actions = np.random.default_rng(episode).uniform(-1.0, 1.0, (10 * _BLOCK, *env.action_space.shape))
+        env.reset(seed=episode)
+        run_physics = _bare_physics(env)
+        for block in np.split(actions.astype(np.float32), 10):
+            env_us.append(_microseconds(lambda block=block: _step_through(env, block)))
+            controls = [env.control_signal(action) for action in block]
+            physics_us.append(_microseconds(lambda controls=controls, run=run_physics: run(controls)))
+    ratio = median(ours / bare for ours, bare in zip(env_us, physics_us, strict=True))
+    return {"env_step_us": median(env_us), "physics_us": median(physics_us), "ratio": ratio}
+
+
+def _step_through(env: DMCEnv, actions: np.ndarray) -> None:
+    for action in actions:
+        env.step(action)
+
+
+def _microseconds(run: Callable[[], None]) -> float:
+    start = time.perf_counter_ns()
+    run()
+    return (time.perf_counter_ns() - start) / 1e3 / _BLOCK
+
+
+def _bare_physics(env: DMCEnv) -> Callable[[list[np.ndarray]], None]:
+    """MuJoCo's calls of one agent step after the other, from a copy of the environment's present state."""
+    import mujoco
+
+    model, repeat = env.physics.model.ptr, range(env.action_repeat)
+    data = mujoco.MjData(model)
+    mujoco.mj_copyData(data, model, env.physics.data.ptr)
+    substeps, runge_kutta = env.num_substeps, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+
+    def run(controls: list[np.ndarray]) -> None:
+        signal = data.ctrl
+        for control in controls:
+            signal[:] = control
+            for _ in repeat:
+                if runge_kutta:
+                    mujoco.mj_step(model, data, substeps)
+                else:
+                    mujoco.mj_step2(model, data)
+                    if substeps > 1:
+                        mujoco.mj_step(model, data, substeps - 1)
+                mujoco.mj_step1(model, data)
+
+    return run

@@ -1,0 +1,165 @@
+"""Environments whose answer is known: a point mass with its optimal policy and five probes with their values.
+
+The probes go from trivial to nearly real, so that the first one that an agent fails names what is broken: 1 the value
+loss, 2 the observations on their way into it, 3 discounting and bootstrapping, 4 the policy's gradient, 5 its
+observations.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+
+from pcil.envs.dmc import checked_action
+
+
+class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A point in the square [-1, 1]^2 that moves by `SPEED` times the action and earns 1 - its distance to the origin.
+
+    An episode starts anywhere and is truncated after `NUM_STEPS` steps.
+    """
+
+    SPEED = 0.1
+    NUM_STEPS = 50
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self, render_mode: None = None) -> None:
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._position, self._steps = np.zeros(2), 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Puts the point anywhere in the square."""
+        super().reset(seed=seed)
+        self._position, self._steps = self.np_random.uniform(-1.0, 1.0, 2), 0
+        return self._position.astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Moves the point; the reward is that of the new position, in [1 - sqrt(2), 1]."""
+        moved = self._position + self.SPEED * checked_action(action, (2,))
+        self._position, self._steps = np.clip(moved, -1.0, 1.0), self._steps + 1
+        reward = 1.0 - float(np.sqrt(np.sum(self._position**2)))
+        return self._position.astype(np.float32), reward, False, self._steps >= self.NUM_STEPS, {}
+
+    @classmethod
+    def optimal_action(cls, obs: np.ndarray) -> np.ndarray:
+        """Straight home along each axis: the axes do not interact, so every step is the closest that can be reached."""
+        return np.clip(-np.asarray(obs) / cls.SPEED, -1.0, 1.0)
+
+
+class Probe(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One number observed, one number acted; terminates after one step unless the probe says otherwise."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self, render_mode: None = None) -> None:
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._obs = np.zeros(1, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Starts with the probe's first observation."""
+        super().reset(seed=seed)
+        self._obs = np.array([self._first_obs()], np.float32)
+        return self._obs, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Pays what the probe pays for this action in this observation."""
+        reward = self._pay(float(self._obs[0]), float(checked_action(action, (1,))[0]))
+        next_obs = self._next_obs(float(self._obs[0]))
+        self._obs = np.array([0.0 if next_obs is None else next_obs], np.float32)
+        return self._obs, reward, next_obs is None, False, {}
+
+    def value(self, obs: float, discount: float) -> float:
+        """The return of the best policy from `obs` on."""
+        raise NotImplementedError
+
+    def _first_obs(self) -> float:
+        return 0.0
+
+    def _next_obs(self, obs: float) -> float | None:
+        """What follows `obs`; None is the end."""
+        del obs
+        return None
+
+    def _pay(self, obs: float, action: float) -> float:
+        raise NotImplementedError
+
+    def _random_sign(self) -> float:
+        return float(self.np_random.choice([-1.0, 1.0]))
+
+
+class ConstantReward(Probe):
+    """Probe 1: reward 1, always. A value that is not 1 means that the value loss or its optimizer is broken."""
+
+    def value(self, obs: float, discount: float) -> float:
+        """1."""
+        del obs, discount
+        return 1.0
+
+    def _pay(self, obs: float, action: float) -> float:
+        del obs, action
+        return 1.0
+
+
+class ObservedReward(Probe):
+    """Probe 2: the reward is the observation, +1 or -1. A value that does not follow means that it is fed wrongly."""
+
+    def value(self, obs: float, discount: float) -> float:
+        """The observation."""
+        del discount
+        return obs
+
+    def _first_obs(self) -> float:
+        return self._random_sign()
+
+    def _pay(self, obs: float, action: float) -> float:
+        del action
+        return obs
+
+
+class DelayedReward(Probe):
+    """Probe 3: two steps, observations 0 and 1, and reward 1 in the second. The first value is the discount."""
+
+    def value(self, obs: float, discount: float) -> float:
+        """1 in the second step, the discount in the first."""
+        return 1.0 if obs > 0.5 else discount
+
+    def _next_obs(self, obs: float) -> float | None:
+        return 1.0 if obs < 0.5 else None
+
+    def _pay(self, obs: float, action: float) -> float:
+        del action
+        return 1.0 if obs > 0.5 else 0.0
+
+
+class ActionReward(Probe):
+    """Probe 4: the reward is -(action - 0.5)^2. A policy that does not go to 0.5 has a broken gradient."""
+
+    def value(self, obs: float, discount: float) -> float:
+        """0, with the best action."""
+        del obs, discount
+        return 0.0
+
+    def optimal_action(self, obs: float) -> float:
+        """0.5."""
+        del obs
+        return 0.5
+
+    def _pay(self, obs: float, action: float) -> float:
+        return -((action - self.optimal_action(obs)) ** 2)
+
+
+class ObservedActionReward(ActionReward):
+    """Probe 5: the reward is -(action - 0.5 * observation)^2, the observation +1 or -1: the policy must look."""
+
+    def optimal_action(self, obs: float) -> float:
+        """Half of the observation."""
+        return 0.5 * obs
+
+    def _first_obs(self) -> float:
+        return self._random_sign()

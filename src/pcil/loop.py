@@ -1,0 +1,249 @@
+"""The loop, one function in the order of time. No method is named here."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pcil import checkpoint, envs, learner, seeds
+from pcil.config import Run
+from pcil.evaluate import Evaluation, evaluate
+from pcil.learner import Learner
+from pcil.metrics import MetricWriter
+from pcil.networks import Actor
+from pcil.policy import Policy
+from pcil.replay import Replay
+from pcil.seeds import Stream
+from pcil.types import Batch, Episode, Spec
+
+
+class Reporter(Protocol):
+    """Who is told how a run goes: a progress bar, or nobody. `stop` is asked between episodes."""
+
+    def episode(self, run: Run, frames: int, total_reward: float) -> None: ...
+    def evaluation(self, run: Run, frames: int, result: Evaluation) -> None: ...
+    def say(self, text: str) -> None: ...
+    def stop(self) -> bool: ...
+
+
+@dataclass(frozen=True)
+class Counters:
+    """Where a run is; with the arrays, all that a checkpoint holds."""
+
+    frames: int = 0
+    steps: int = 0
+    """Agent steps."""
+    episodes: int = 0
+    updates: int = 0
+    evaluations: int = 0
+    seconds: float = 0.0
+    """Wall-clock time until now, over all sessions."""
+
+
+@dataclass
+class State:
+    """What the loop carries from episode to episode."""
+
+    learner: Learner
+    actor: Actor
+    """The actor as it left the last update."""
+    replay: Replay
+    counters: Counters
+
+
+class Stopped(Exception):
+    """The run was asked to stop, and has saved itself."""
+
+
+def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> tuple[State, Evaluation]:
+    """Train until `run.frames`, resuming from the folder's newest whole checkpoint; each pass of the loop is one episode.
+
+    Returns the final state and the final evaluation. Raises `Stopped` where the reporter asks for it.
+    """
+    env = envs.make(run.task)
+    spec = envs.spec(env)
+    rollout = [envs.make(run.task) for _ in range(run.evaluate_episodes)]
+    state, positions = _resume(run, folder, _start(run, spec, demos), reporter)
+    log = MetricWriter(folder, positions, state.counters.frames)
+    clock = _Clock(state.counters.seconds)
+    saved = clock.total()
+
+    while state.counters.frames < run.frames:
+        if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
+            _evaluate(run, folder, state, rollout, log, clock, reporter)
+
+        episode = _play(run, env, spec, state, demos)
+        learned, correlation = _label(run, state, episode)
+        state.replay.add(episode, learned if run.label == "stored" else episode.reward)
+        _log_episode(state, episode, learned, correlation, log, clock)
+        reporter.episode(run, state.counters.frames, episode.total_reward)
+
+        stop = reporter.stop()
+        if stop or clock.total() - saved >= run.checkpoint_seconds:
+            _save(folder, state, log, clock, replay=True)
+            saved = clock.total()
+        if stop:
+            raise Stopped
+
+    result = _evaluate(run, folder, state, rollout, log, clock, reporter)
+    _save(folder, state, log, clock, replay=False)
+    log.close()
+    return state, result
+
+
+def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State, demos: Batch) -> Episode:
+    """One episode: act, update (the device works while the environment steps), step."""
+    counters = state.counters
+    act_rng = seeds.rng(run.seed, Stream.ACT, counters.episodes)
+    sample_rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
+    seed = seeds.episode_seed(run.seed, Stream.EPISODE, counters.episodes)
+    observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
+    host: Actor | None = None
+    over = terminated = False
+    while not over:
+        if counters.frames < run.random_frames:
+            action = act_rng.uniform(-1, 1, spec.action_dim).astype(np.float32)
+        else:
+            host = host or on_host(state.actor)
+            action = run.agent.explore(host, observations[-1], step=counters.steps, rng=act_rng)
+        if _update_due(run, state.replay, counters):
+            window = state.replay.sample(sample_rng, run.agent.batch_size, run.agent.n_step)
+            rows = sample_rng.integers(max(len(demos.obs), 1), size=run.reward.batch_size)
+            expert = Batch(demos.obs[rows], demos.action[rows])
+            step, count = np.int32(counters.steps), np.int32(counters.updates)
+            state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, step, count)
+            counters, host = replace(counters, updates=counters.updates + 1), None
+        obs, reward, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+        observations.append(obs)
+        actions.append(action)
+        rewards.append(reward)
+        counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
+    state.counters = replace(counters, episodes=counters.episodes + 1)
+    return Episode(np.stack(observations), np.stack(actions), np.array(rewards, np.float64), terminated, seed)
+
+
+def _update_due(run: Run, replay: Replay, counters: Counters) -> bool:
+    return (
+        counters.frames >= run.seed_frames
+        and counters.steps % run.update_every == 0
+        and replay.num_windows(run.agent.n_step) > 0
+    )
+
+
+def on_host(actor: Actor) -> Actor:
+    """The actor's arrays in NumPy; waits until the update that makes them has finished."""
+    return jax.tree.map(np.asarray, actor)
+
+
+def _label(run: Run, state: State, episode: Episode) -> tuple[np.ndarray, float]:
+    """The learned reward of each step of an episode, by the networks of this moment, and its correlation with the true one."""
+    count = np.int32(state.counters.episodes)
+    true = episode.reward.astype(np.float32)
+    learned, correlation = learner.label_episode(run.learner, state.learner, episode.obs, episode.action, true, count)
+    return np.asarray(learned), float(correlation)
+
+
+def _log_episode(
+    state: State, episode: Episode, learned: np.ndarray, correlation: float, log: MetricWriter, clock: _Clock
+) -> None:
+    """One line for the episode: its return, what the learned reward made of it, and the mean of each update's metrics."""
+    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items()}
+    updates = totals.pop("updates")
+    values: dict[str, Any] = {
+        "episode": state.counters.episodes,
+        "return": episode.total_reward,
+        "length": len(episode),
+        "learned_return": float(learned.sum(dtype=np.float64)),
+        "correlation": correlation,
+        "updates": state.counters.updates,
+    }
+    values |= {name: total / updates for name, total in totals.items() if updates}
+    values |= {"seconds": round(clock.total(), 2), "frames_per_second": round(clock.rate(state.counters.frames), 1)}
+    log.episode(state.counters.frames, values)
+    zeros = {name: jnp.zeros(()) for name in state.learner.totals}
+    state.learner = Learner(state.learner.agent, state.learner.reward, state.learner.root, zeros)
+
+
+def _evaluate(
+    run: Run,
+    folder: Path,
+    state: State,
+    rollout: list[gymnasium.Env],
+    log: MetricWriter,
+    clock: _Clock,
+    reporter: Reporter,
+) -> Evaluation:
+    """Roll out the mean action, write `eval.csv`, and leave the policy of this moment in the folder."""
+    host = on_host(state.actor)
+    result = evaluate(lambda obs: host(obs, np), rollout, seed=run.seed)
+    log.evaluation(state.counters.frames, clock.total(), result)
+    state.counters = replace(state.counters, evaluations=state.counters.evaluations + 1)
+    info = {
+        "method": run.method,
+        "preset": run.preset,
+        "seed": run.seed,
+        "frames": state.counters.frames,
+        "return_mean": result.mean,
+        "action_repeat": envs.spec(rollout[0]).action_repeat,
+    }
+    Policy(host, envs.task_name(run.task), info).save(folder / "policy")
+    reporter.evaluation(run, state.counters.frames, result)
+    return result
+
+
+def _start(run: Run, spec: Spec, demos: Batch) -> State:
+    """The state before the first step."""
+    fresh = learner.init(run.learner, spec, demos, run.seed)
+    replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
+    return State(fresh, jax.tree.map(jnp.copy, run.agent.actor(fresh.agent)), replay, Counters())
+
+
+def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock, *, replay: bool) -> None:
+    """Everything that the rest of the run depends on; a finished run needs no replay."""
+    counters = replace(state.counters, seconds=clock.total())
+    arrays = checkpoint.flatten("learner", state.learner)
+    if replay:
+        arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
+    meta = {"counters": asdict(counters), "positions": log.positions()}
+    checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
+
+
+def _resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[State, dict[str, int]]:
+    """The state of the newest whole checkpoint and the lengths its logs had; `fresh` and no lengths where there is none."""
+    arrays, meta, complaints = checkpoint.restore(folder / "checkpoint")
+    for complaint in complaints:
+        reporter.say(complaint)
+    if arrays is None:
+        return fresh, {}
+    restored = checkpoint.unflatten("learner", fresh.learner, arrays)
+    fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
+    counters = Counters(**meta["counters"])
+    reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
+    actor = jax.tree.map(jnp.copy, run.agent.actor(restored.agent))
+    return State(restored, actor, fresh.replay, counters), meta["positions"]
+
+
+class _Clock:
+    """Wall-clock seconds, going on from where an earlier session stopped."""
+
+    def __init__(self, before: float) -> None:
+        self._before, self._begin = before, time.perf_counter()
+        self._last: tuple[int, float] | None = None
+
+    def total(self) -> float:
+        """Seconds over all sessions."""
+        return self._before + time.perf_counter() - self._begin
+
+    def rate(self, frames: int) -> float:
+        """Frames a second since the last call."""
+        now = self.total()
+        before, self._last = self._last, (frames, now)
+        return (frames - before[0]) / max(now - before[1], 1e-9) if before else 0.0

@@ -1,0 +1,75 @@
+"""What a run writes while it goes: `eval.csv`, `train.jsonl` and TensorBoard, all rewound to the checkpoint on resume."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcil.evaluate import Evaluation
+
+EVAL_COLUMNS = ("frames", "episode", "return", "length", "seconds")
+WALL_CLOCK = ("seconds", "frames_per_second")
+"""Columns that differ between two runs of the same settings; all others are equal."""
+
+
+class MetricWriter:
+    """Appends rows; every row is on disk when the call returns."""
+
+    def __init__(self, folder: Path, positions: dict[str, int], frames: int) -> None:
+        """`positions` are the bytes of each file that belong to the checkpoint at `frames`; what follows them is cut off."""
+        from tensorboardX import SummaryWriter
+
+        self._files = {name: self._open(folder / name, positions.get(name, 0)) for name in ("eval.csv", "train.jsonl")}
+        if not positions.get("eval.csv"):
+            self._write("eval.csv", ",".join(EVAL_COLUMNS) + "\n")
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=frames or None)
+
+    def positions(self) -> dict[str, int]:
+        """Length of each file in bytes, for the checkpoint."""
+        return {name: file.tell() for name, file in self._files.items()}
+
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+        """One row of `eval.csv` an episode."""
+        text = io.StringIO()
+        rows = zip(result.returns, result.lengths, strict=True)
+        csv.writer(text, lineterminator="\n").writerows(
+            (frames, i, repr(float(total)), int(length), f"{seconds:.1f}") for i, (total, length) in enumerate(rows)
+        )
+        self._write("eval.csv", text.getvalue())
+        self._board.add_scalar("evaluation/return", result.mean, frames)
+
+    def episode(self, frames: int, values: dict[str, Any]) -> None:
+        """One line of `train.jsonl`, and the same numbers to TensorBoard."""
+        self._write("train.jsonl", json.dumps({"frames": frames, **values}) + "\n")
+        for name, value in values.items():
+            if isinstance(value, float) and np.isfinite(value):
+                self._board.add_scalar(name if "/" in name else f"episode/{name}", value, frames)
+
+    def close(self) -> None:
+        """Flush everything."""
+        self._board.close()
+        for file in self._files.values():
+            file.close()
+
+    @staticmethod
+    def _open(path: Path, position: int) -> io.BufferedRandom:
+        file = path.open("r+b" if path.exists() else "w+b")
+        file.truncate(position)
+        file.seek(position)
+        return file
+
+    def _write(self, name: str, text: str) -> None:
+        self._files[name].write(text.encode())
+        self._files[name].flush()
+
+
+def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
+    """The columns of a run's `eval.csv`, as arrays."""
+    with (folder / "eval.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in EVAL_COLUMNS}

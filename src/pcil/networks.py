@@ -1,0 +1,109 @@
+"""The networks, each written once: `xp=jnp` inside the compiled step, `xp=np` where a policy acts on the host.
+
+Weights are `[in, out]`. Every linear layer starts orthogonal with gain 1 and bias 0 (authors' code: utils.py, `weight_init`).
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+LAYER_NORM_EPSILON = 1e-5
+
+
+def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "in out"]:
+    """A random matrix with orthonormal rows or columns, whichever are fewer."""
+    return jax.nn.initializers.orthogonal()(key, shape, jnp.float32)
+
+
+class MLP(eqx.Module):
+    """Linear layers with ReLU between them; the last layer is linear."""
+
+    weights: tuple[Float[Array, "in out"], ...]
+    biases: tuple[Float[Array, " out"], ...]
+
+    @classmethod
+    def init(cls, sizes: tuple[int, ...], *, key: PRNGKeyArray) -> MLP:
+        """`sizes` = input, hidden ..., output."""
+        keys = jax.random.split(key, len(sizes) - 1)
+        shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+        weights = tuple(orthogonal(k, shape) for k, shape in zip(keys, shapes, strict=True))
+        return cls(weights, tuple(jnp.zeros(out) for _, out in shapes))
+
+    def __call__(self, x: Float[Array, "*batch in"], xp: ModuleType = jnp) -> Float[Array, "*batch out"]:
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = xp.maximum(x @ weight + bias, 0)
+        return x @ self.weights[-1] + self.biases[-1]
+
+
+class Trunk(eqx.Module):
+    """Linear, layer normalisation, tanh: observations to features in (-1, 1) (DrQ-v2 on states; `algorithms` section 2.1)."""
+
+    weight: Float[Array, "obs features"]
+    bias: Float[Array, " features"]
+    scale: Float[Array, " features"]
+    offset: Float[Array, " features"]
+
+    @classmethod
+    def init(cls, obs_dim: int, feature_dim: int, *, key: PRNGKeyArray) -> Trunk:
+        return cls(
+            orthogonal(key, (obs_dim, feature_dim)), jnp.zeros(feature_dim), jnp.ones(feature_dim), jnp.zeros(feature_dim)
+        )
+
+    def __call__(self, obs: Float[Array, "*batch obs"], xp: ModuleType = jnp) -> Float[Array, "*batch features"]:
+        x = obs @ self.weight + self.bias
+        centred = x - x.mean(axis=-1, keepdims=True)
+        variance = (centred * centred).mean(axis=-1, keepdims=True)
+        return xp.tanh(centred / xp.sqrt(variance + LAYER_NORM_EPSILON) * self.scale + self.offset)
+
+
+class Actor(eqx.Module):
+    """The mean action: trunk, two hidden layers, tanh."""
+
+    trunk: Trunk
+    head: MLP
+
+    @classmethod
+    def init(cls, obs_dim: int, action_dim: int, feature_dim: int, hidden: int, *, key: PRNGKeyArray) -> Actor:
+        trunk_key, head_key = jax.random.split(key)
+        head = MLP.init((feature_dim, hidden, hidden, action_dim), key=head_key)
+        return cls(Trunk.init(obs_dim, feature_dim, key=trunk_key), head)
+
+    def __call__(self, obs: Float[Array, "*batch obs"], xp: ModuleType = jnp) -> Float[Array, "*batch action"]:
+        return xp.tanh(self.head(self.trunk(obs, xp), xp))
+
+
+class Critic(eqx.Module):
+    """Two values of a state and an action on one trunk; the trunk's features are what imitation rewards see."""
+
+    trunk: Trunk
+    heads: tuple[MLP, MLP]
+
+    @classmethod
+    def init(cls, obs_dim: int, action_dim: int, feature_dim: int, hidden: int, *, key: PRNGKeyArray) -> Critic:
+        trunk_key, *head_keys = jax.random.split(key, 3)
+        sizes = (feature_dim + action_dim, hidden, hidden, 1)
+        first, second = (MLP.init(sizes, key=k) for k in head_keys)
+        return cls(Trunk.init(obs_dim, feature_dim, key=trunk_key), (first, second))
+
+    def __call__(
+        self, obs: Float[Array, "*batch obs"], action: Float[Array, "*batch action"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        return self.values(self.trunk(obs), action)
+
+    def values(
+        self, features: Float[Array, "*batch features"], action: Float[Array, "*batch action"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        """Both values from features of the trunk."""
+        x = jnp.concatenate([features, action], axis=-1)
+        first, second = (head(x)[..., 0] for head in self.heads)
+        return first, second
+
+
+def unit_sphere(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+    """Each row scaled to length 1, with a finite gradient at 0."""
+    return x / jnp.sqrt(jnp.sum(x * x, axis=-1, keepdims=True) + 1e-12)

@@ -1,0 +1,101 @@
+"""A trained policy on its own: a NumPy function of the observation, saved as safetensors and JSON (no code in the files)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from pcil.networks import MLP, Actor, Trunk
+from pcil.types import InputError, Spec
+
+FORMAT = "pcil-policy-1"
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """The mean action of a trained actor: `policy(obs [*, obs]) -> action [*, action]`, float32 in [-1, 1]."""
+
+    actor: Actor
+    task: str
+    info: dict[str, Any] = field(default_factory=dict)
+    """Where it comes from: method, frames, seed, settings, commit."""
+
+    @property
+    def spec(self) -> Spec:
+        """Sizes of observation and action."""
+        return Spec(self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0], self.info.get("action_repeat", 1))
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        obs = np.asarray(obs, np.float32)
+        if obs.shape[-1:] != (self.spec.obs_dim,):
+            raise InputError(
+                f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers; got an array of shape {obs.shape}."
+            )
+        return self.actor(obs, np)
+
+    def save(self, folder: Path) -> None:
+        """Write `policy.safetensors` and `policy.json` into `folder`, each by a rename, so neither is ever half written."""
+        from safetensors.numpy import save_file
+
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays = {name: np.ascontiguousarray(array) for name, array in _named(self.actor).items()}
+        save_file(arrays, folder / "policy.safetensors.tmp")
+        text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
+        (folder / "policy.json.tmp").write_text(text + "\n")
+        for name in ("policy.safetensors", "policy.json"):
+            (folder / f"{name}.tmp").replace(folder / name)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """The policy of a run folder, or of a folder that holds `policy.safetensors` and `policy.json`.
+
+    Raises `InputError` where there is none or where the files are damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    folder = Path(path)
+    folder = folder / "policy" if (folder / "policy").is_dir() else folder
+    if not (folder / "policy.json").is_file() or not (folder / "policy.safetensors").is_file():
+        raise InputError(f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made.")
+    try:
+        header = json.loads((folder / "policy.json").read_text())
+        arrays = load_file(folder / "policy.safetensors")
+        actor = _build(header, arrays)
+    except (ValueError, KeyError, TypeError, AttributeError, SafetensorError, OSError) as error:
+        raise InputError(f"The policy in {folder} is damaged ({type(error).__name__}: {error}); train or copy it again.") from error
+    return Policy(actor, header["task"], header.get("info", {}))
+
+
+def _named(actor: Actor) -> dict[str, np.ndarray]:
+    """Arrays by their path in the tree, such as `head.weights.0`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(actor, eqx.is_array))
+    return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
+
+
+def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
+    """The actor from its arrays; every shape must follow from the one before."""
+    if header["format"] != FORMAT:
+        raise ValueError(f"format {header['format']!r} is not {FORMAT!r}")
+    layers = range(int(header["layers"]))
+    trunk = Trunk(*(arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset")))
+    weights = tuple(arrays[f"head.weights.{i}"] for i in layers)
+    biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
+    if not header["task"] or len(arrays) != 4 + 2 * len(layers):
+        raise ValueError("names and arrays do not fit")
+    width = trunk.weight.shape[1]
+    if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
+        raise ValueError("the trunk's shapes do not fit")
+    for weight, bias in zip(weights, biases, strict=True):
+        if weight.shape != (width, *bias.shape):
+            raise ValueError(f"a layer of shape {weight.shape} follows one of width {width}")
+        width = bias.shape[0]
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        raise ValueError("it holds values that are not finite")
+    return Actor(trunk, MLP(weights, biases))

@@ -1,0 +1,87 @@
+"""Adversarial imitation: a discriminator of expert and agent states, and DAC's reward, its logit.
+
+Kostrikov et al. 2019 in the form of the authors' code (agent/dac.py): the features of the critic's trunk go in, no actions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.losses import binary_cross_entropy, gradient_penalty, interpolate
+from pcil.networks import MLP
+from pcil.rewards.base import Embed, Metrics, Reward
+from pcil.types import Batch
+
+
+class DiscriminatorState(eqx.Module):
+    """The discriminator and its optimiser's moments."""
+
+    discriminator: MLP
+    moments: optax.OptState
+
+
+@dataclass(frozen=True)
+class DAC(Reward):
+    """Settings of DAC's reward: `log D - log(1 - D)`, which is the logit itself, so it is never computed by logarithms."""
+
+    penalty: float = 10.0
+    """Weight of the gradient penalty on the logit."""
+    hidden: int = 256
+    """Width of the two hidden layers."""
+    learning_rate: float = 1e-4
+    """Adam's."""
+
+    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
+        features = jax.eval_shape(embed, jnp.asarray(demos.obs)).shape[-1]
+        discriminator = MLP.init((features, self.hidden, self.hidden, 1), key=key)
+        return DiscriminatorState(discriminator, optax.adam(self.learning_rate).init(discriminator))
+
+    def loss(
+        self,
+        discriminator: MLP,
+        expert: Float[Array, "batch features"],
+        agent: Float[Array, "batch features"],
+        *,
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """Cross-entropy with label 1 for the expert, plus the penalty on the logit's slope between the two."""
+        logits = discriminator(jnp.concatenate([expert, agent]))[:, 0]
+        expert_logit, agent_logit = jnp.split(logits, [expert.shape[0]])
+        entropy = binary_cross_entropy(expert_logit, agent_logit)
+        mixed = interpolate(jax.random.uniform(key, (expert.shape[0], 1)), expert, agent[: expert.shape[0]])
+        slope = gradient_penalty(lambda x: discriminator(x)[:, 0], mixed)
+        right = jnp.mean(expert_logit > 0, dtype=jnp.float32) + jnp.mean(agent_logit < 0, dtype=jnp.float32)
+        metrics = {
+            "entropy_loss": entropy,
+            "penalty": slope,
+            "accuracy": right / 2,
+            "expert_logit": jnp.mean(expert_logit),
+            "agent_logit": jnp.mean(agent_logit),
+        }
+        return entropy + self.penalty * slope, metrics
+
+    def update(
+        self, state: DiscriminatorState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
+    ) -> tuple[DiscriminatorState, Metrics]:
+        features = embed(jnp.asarray(expert.obs)), embed(jnp.asarray(agent.obs))
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *features, key=key)
+        change, moments = optax.adam(self.learning_rate).update(gradient, state.moments)
+        return DiscriminatorState(optax.apply_updates(state.discriminator, change), moments), metrics
+
+    def reward(
+        self,
+        state: DiscriminatorState,
+        obs: Float[Array, "T obs"],
+        action: Float[Array, "T action"],
+        embed: Embed,
+        *,
+        key: PRNGKeyArray,
+    ) -> Float[Array, " T"]:
+        del action, key
+        return state.discriminator(embed(obs))[:, 0]

@@ -1,0 +1,72 @@
+"""The reward's seam: a frozen dataclass of settings with pure methods; all that changes is its state, a pytree."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.types import Batch
+
+Metrics = dict[str, Float[Array, ""]]
+Embed = Callable[[Float[Array, "*batch obs"]], Float[Array, "*batch features"]]
+"""The agent's features of an observation; no gradient flows through them."""
+
+
+@dataclass(frozen=True)
+class Reward(abc.ABC):
+    """An imitation reward: learned from demonstrations and from what the agent does.
+
+    `scope` says what `reward` must be given: "step" for any steps in any order, "episode" for one whole episode in the order
+    of time. `reads` says which state of a step it is given: "next_obs", the state that the step led to, or "obs", the state
+    in which the action was taken (what a reward of state-action pairs needs). `needs_demos` is False where no
+    demonstrations are used at all.
+    """
+
+    scope: ClassVar[Literal["step", "episode"]] = "step"
+    reads: ClassVar[Literal["obs", "next_obs"]] = "next_obs"
+    needs_demos: ClassVar[bool] = True
+
+    task_weight: float = 0.0
+    """Weight of the environment's own reward, which is added to the learned one."""
+    batch_size: int = 128
+    """Expert steps in one update, and as many of the agent."""
+
+    @abc.abstractmethod
+    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> Any:
+        """The state before the first update; `demos` are all expert states and actions in the order of time."""
+
+    @abc.abstractmethod
+    def update(
+        self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
+    ) -> tuple[Any, Metrics]:
+        """One gradient step on a batch of expert steps and one of agent steps."""
+
+    @abc.abstractmethod
+    def reward(
+        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: PRNGKeyArray
+    ) -> Float[Array, " T"]:
+        """The reward of `T` steps; which state `obs` holds is said by `reads`."""
+
+
+def label(
+    settings: Reward,
+    state: Any,
+    obs: Float[Array, "*batch n+1 obs"],
+    action: Float[Array, "*batch n action"],
+    task_reward: Float[Array, "*batch n"],
+    embed: Embed,
+    *,
+    key: PRNGKeyArray,
+) -> Float[Array, "*batch n"]:
+    """What the agent is trained on: the learned reward plus the weighted reward of the environment.
+
+    This is the one place where the two meet. Leading dimensions are flattened, so a reward sees rows of steps only.
+    """
+    seen = obs[..., 1:, :] if settings.reads == "next_obs" else obs[..., :-1, :]
+    rows, row_actions = seen.reshape(-1, seen.shape[-1]), action.reshape(-1, action.shape[-1])
+    learned = settings.reward(state, rows, row_actions, embed, key=key)
+    return learned.reshape(task_reward.shape) + settings.task_weight * task_reward

@@ -1,0 +1,123 @@
+"""Policy contrastive imitation learning: an expert-centred embedding on the unit sphere and a similarity reward.
+
+Paper sections 3.2, 3.3 and Appendix B. `docs/methods/pcil.md` numbers every point where we differ from the paper or from the
+authors' code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.losses import gradient_penalty, info_nce, interpolate
+from pcil.networks import MLP, unit_sphere
+from pcil.rewards.base import Embed, Metrics, Reward
+from pcil.types import Batch
+
+
+class PCILState(eqx.Module):
+    """The encoder, its optimiser's moments, and the expert states that rewards compare with."""
+
+    encoder: MLP
+    moments: optax.OptState
+    reference: Float[Array, "batch obs"]
+    """The last batch of expert states: partners of the penalty and of the similarity reward."""
+
+
+def similarity(
+    embedding: Float[Array, "T dim"], expert: Float[Array, "batch dim"], how: Literal["random", "mean"]
+) -> Float[Array, " T"]:
+    """The reward `Phi(s) . Phi(s_E)`, in [-1, 1] for unit embeddings (Eq. 2).
+
+    "random" compares step `i` with expert row `i mod batch`, and since the rows are random draws each step meets a random
+    expert sample (authors' code: train.py); "mean" compares with the rows' mean (paper, Appendix B: "similar performance").
+    """
+    if how == "mean":
+        return embedding @ jnp.mean(expert, axis=0)
+    rows = jnp.arange(embedding.shape[0]) % expert.shape[0]
+    return jnp.sum(embedding * expert[rows], axis=-1)
+
+
+@dataclass(frozen=True)
+class PCIL(Reward):
+    """Settings of PCIL's reward."""
+
+    temperature: float = 1.0
+    """Divides the cosines inside the InfoNCE loss."""
+    compare: Literal["random", "mean"] = "random"
+    """The reward's expert: a random sample or the mean embedding."""
+    penalty: float = 10.0
+    """Weight of the gradient penalty on the similarity reward."""
+    hidden: int = 256
+    """Width of the three hidden layers; the embedding has a quarter of it."""
+    learning_rate: float = 1e-4
+    """Adam's."""
+
+    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> PCILState:
+        encoder_key, reference_key = jax.random.split(key)
+        rows = jax.random.randint(reference_key, (self.batch_size,), 0, demos.obs.shape[0])
+        reference = jnp.asarray(demos.obs)[rows]
+        features = jax.eval_shape(embed, reference).shape[-1]
+        encoder = MLP.init((features, self.hidden, self.hidden, self.hidden, self.hidden // 4), key=encoder_key)
+        return PCILState(encoder, optax.adam(self.learning_rate).init(encoder), reference)
+
+    def loss(
+        self,
+        encoder: MLP,
+        expert: Float[Array, "batch features"],
+        agent: Float[Array, "batch features"],
+        partner: Float[Array, "batch features"],
+        *,
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """InfoNCE with expert anchors and all agent samples as negatives, plus the penalty on the reward's slope.
+
+        An anchor's positive is one random other row of the expert batch. The penalty is taken on the features between an
+        expert and an agent row; its scalar is `Phi(mix) . Phi(partner)`, the reward, with the partner's side held fixed.
+        """
+        shift_key, mix_key = jax.random.split(key)
+        raw = encoder(jnp.concatenate([expert, agent]))
+        sphere = unit_sphere(raw)
+        anchor, negatives = jnp.split(sphere, [expert.shape[0]])
+        positive = anchor[derangement(shift_key, expert.shape[0])]
+        contrast, diagnostics = info_nce(anchor, positive, negatives, self.temperature)
+
+        fixed = jax.lax.stop_gradient(unit_sphere(encoder(partner)))
+        u = jax.random.uniform(mix_key, (expert.shape[0], 1))
+        mixed = interpolate(u, expert, agent[: expert.shape[0]])
+        slope = gradient_penalty(lambda x: jnp.sum(unit_sphere(encoder(x)) * fixed, axis=-1), mixed)
+        metrics = diagnostics | {
+            "contrast_loss": contrast,
+            "penalty": slope,
+            "embedding_norm": jnp.mean(jnp.linalg.norm(raw, axis=-1)),
+        }
+        return contrast + self.penalty * slope, metrics
+
+    def update(
+        self, state: PCILState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
+    ) -> tuple[PCILState, Metrics]:
+        features = [embed(jnp.asarray(obs)) for obs in (expert.obs, agent.obs, state.reference)]
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, key=key)
+        change, moments = optax.adam(self.learning_rate).update(gradient, state.moments)
+        encoder = optax.apply_updates(state.encoder, change)
+        return PCILState(encoder, moments, jnp.asarray(expert.obs)), metrics
+
+    def reward(
+        self, state: PCILState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
+    ) -> Float[Array, " T"]:
+        del action, key
+        both = unit_sphere(state.encoder(embed(jnp.concatenate([state.reference, obs]))))
+        expert, agent = jnp.split(both, [state.reference.shape[0]])
+        return similarity(agent, expert, self.compare)
+
+
+def derangement(key: PRNGKeyArray, size: int) -> Array:
+    """Random partners, none of them oneself: a random order, shifted by one along itself."""
+    order = jax.random.permutation(key, size)
+    return jnp.zeros(size, order.dtype).at[order].set(jnp.roll(order, 1))

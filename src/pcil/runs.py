@@ -1,0 +1,187 @@
+"""Run folders: who may write there, what `run.json` says, when a run is done; and `train`, the call that starts or resumes one."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import platform
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcil import envs, loop, presets
+from pcil.config import Run, differences
+from pcil.demos import Demonstrations
+from pcil.evaluate import Evaluation
+from pcil.policy import Policy, load_policy
+from pcil.types import Batch, InputError
+
+PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
+
+
+@dataclass(frozen=True)
+class Result:
+    """A finished run."""
+
+    folder: Path
+    final_return: float
+    """Mean return of the last evaluation."""
+    demos_return: float | None
+    """Mean return of the demonstrations, where there were any."""
+
+    @property
+    def policy(self) -> Policy:
+        """What was learned."""
+        return load_policy(self.folder)
+
+
+class Silent:
+    """A reporter that tells nobody and never stops."""
+
+    def episode(self, run: Run, frames: int, total_reward: float) -> None:
+        del run, frames, total_reward
+
+    def evaluation(self, run: Run, frames: int, result: Evaluation) -> None:
+        del run, frames, result
+
+    def say(self, text: str) -> None:
+        del text
+
+    def stop(self) -> bool:
+        return False
+
+
+def train(
+    task: str,
+    *,
+    out: str | Path,
+    method: str = "pcil",
+    preset: str = "default",
+    reporter: loop.Reporter | None = None,
+    **changes: Any,
+) -> Result:
+    """Train a policy in the folder `out`, or resume or report what is there.
+
+    `changes` are fields of `Run` (`seed=1`, `frames=200_000`, `demos=...`). Raises `InputError` where something given is
+    wrong, and `loop.Stopped` where the reporter asks to stop.
+    """
+    changes = {name: value for name, value in changes.items() if value is not None}
+    return execute(presets.make(envs.task_name(task), method, preset, **changes), Path(out), reporter or Silent())
+
+
+def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
+    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
+    environment = envs.make(run.task)
+    demos = demonstrations(run)
+    if demos is not None:
+        demos.validate(envs.spec(environment))
+    environment.close()
+    with _claimed(folder):
+        _describe(folder, run, demos, reporter)
+        if not (folder / "DONE").exists():
+            with _full_disk_is_input_error(folder):
+                _, final = loop.train_loop(run, folder, _batch(demos, run), reporter)
+                _write(folder / "DONE", json.dumps({"final_return": final.mean}) + "\n")
+        done = json.loads((folder / "DONE").read_text())
+    return Result(folder, done["final_return"], demos.return_mean if demos else None)
+
+
+def demonstrations(run: Run) -> Demonstrations | None:
+    """What the run imitates, or None where its reward needs no demonstrations."""
+    if not run.reward.needs_demos:
+        return None
+    return Demonstrations.load(run.demos or run.task).take(run.num_demos)
+
+
+def _batch(demos: Demonstrations | None, run: Run) -> Batch:
+    if demos is not None:
+        return Batch(demos.obs, demos.action)
+    spec = envs.spec(envs.make(run.task))
+    return Batch(np.zeros((0, spec.obs_dim), np.float32), np.zeros((0, spec.action_dim), np.float32))
+
+
+@contextlib.contextmanager
+def _claimed(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, for this process alone."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise InputError(f"The folder {folder} can't be written ({error.strerror}); give --out another one.") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"Another process is training in {folder}; wait for it or give --out another folder.") from None
+        yield
+
+
+def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: loop.Reporter) -> None:
+    """Write `run.json`, or check that the one which is there describes this very run."""
+    about = {
+        "run": run.to_json(),
+        "demos": demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean},
+        "versions": {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "commit": commit(),
+    }
+    about = json.loads(json.dumps(about))
+    path = folder / "run.json"
+    if not path.exists():
+        strangers = sorted(p.name for p in folder.iterdir() if p.name != ".lock" and p.suffix != ".tmp")
+        if strangers:
+            raise InputError(f"The folder {folder} holds something else ({strangers[0]}); give --out a new or empty folder.")
+        _write(path, json.dumps(about, indent=2) + "\n")
+        return
+    try:
+        before = json.loads(path.read_text())
+        changed = differences(before["run"], about["run"]) + differences(before["demos"] or {}, about["demos"] or {}, "demos.")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder.") from error
+    if changed:
+        raise InputError(f"The folder {folder} holds another run: {'; '.join(changed)}; use its settings or another --out.")
+    updated = differences(before.get("versions", {}), about["versions"])
+    if updated and not (folder / "DONE").exists():
+        reporter.say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
+
+
+def commit() -> str | None:
+    """The commit of the source tree that is running, with "+" where files differ from it; None outside a repository."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        if not git("ls-files", "runs.py"):
+            return None
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", ".") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _write(path: Path, text: str) -> None:
+    """The whole file or nothing."""
+    partial = path.with_suffix(path.suffix + ".tmp")
+    partial.write_text(text)
+    partial.replace(path)
+
+
+@contextlib.contextmanager
+def _full_disk_is_input_error(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        full = getattr(error, "errno", None) == errno.ENOSPC or "No space left on device" in str(error)
+        if not full:
+            raise
+        raise InputError(
+            f"The disk is full, so the run in {folder} stopped; its last checkpoint is whole: free some space and give the "
+            "same command again."
+        ) from error

@@ -1,0 +1,76 @@
+"""The value types that cross the seams. They check themselves once, when they are made, and never change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Shaped
+
+
+class InputError(Exception):
+    """Something that a person gave is wrong. The command line prints it as one sentence and exits with code 2."""
+
+
+class Spec(NamedTuple):
+    """What the networks must know of an environment."""
+
+    obs_dim: int
+    action_dim: int
+    action_repeat: int
+    """Control steps (frames) for each agent step."""
+
+
+class Batch(NamedTuple):
+    """States and the actions taken in them, row by row: `obs[i]` is where `action[i]` was taken."""
+
+    obs: Float[Array | np.ndarray, "batch obs"]
+    action: Float[Array | np.ndarray, "batch action"]
+
+
+class Window(NamedTuple):
+    """`n` consecutive steps from each of `batch` random starts, all within one episode.
+
+    Step `t` leads from `obs[:, t]` by `action[:, t]` to `obs[:, t + 1]` with `reward[:, t]`. `discount[:, t]` is 0 where that
+    step terminated the episode and in the padding after it, and 1 elsewhere: a time limit is no termination, and no
+    window reaches past one.
+    """
+
+    obs: Float[Array | np.ndarray, "batch n+1 obs"]
+    action: Float[Array | np.ndarray, "batch n action"]
+    reward: Float[Array | np.ndarray, "batch n"]
+    discount: Float[Array | np.ndarray, "batch n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One whole episode of `T` agent steps; the arrays are made read-only.
+
+    `obs[t]` is where `action[t]` was taken, `reward[t]` what the environment paid for it. `terminated` says that the task
+    ended (no future), otherwise the episode was cut by a time limit. `seed` is what the environment was reset with.
+    """
+
+    obs: Float[np.ndarray, "T+1 obs"]
+    action: Float[np.ndarray, "T action"]
+    reward: Shaped[np.ndarray, " T"]
+    terminated: bool = False
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        steps = len(self.action)
+        if steps == 0 or len(self.obs) != steps + 1 or len(self.reward) != steps:
+            raise InputError(
+                f"An episode of T actions needs T+1 observations, T rewards and T of at least 1; "
+                f"got {steps} actions, {len(self.obs)} observations and {len(self.reward)} rewards."
+            )
+        for array in (self.obs, self.action, self.reward):
+            array.flags.writeable = False
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    @property
+    def total_reward(self) -> float:
+        """The return: the undiscounted sum of the environment's rewards."""
+        return float(np.sum(self.reward, dtype=np.float64))

@@ -1,0 +1,35 @@
+"""Policies from demonstrations: Policy Contrastive Imitation Learning (ICML 2023) and its baselines.
+
+    run = pcil.train("walker_walk", method="pcil", seed=1, frames=200_000, out="runs/ww")
+    policy = pcil.load_policy("runs/ww")
+    action = policy(obs)
+
+Names load on first use, so that `import pcil` and `pcil --help` stay fast.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+__all__ = ["Demonstrations", "Episode", "InputError", "Policy", "Reward", "load_policy", "make_env", "record", "train"]
+
+_HOME = {
+    "Demonstrations": ("pcil.demos", "Demonstrations"),
+    "Episode": ("pcil.types", "Episode"),
+    "InputError": ("pcil.types", "InputError"),
+    "Policy": ("pcil.policy", "Policy"),
+    "Reward": ("pcil.rewards", "Reward"),
+    "load_policy": ("pcil.policy", "load_policy"),
+    "make_env": ("pcil.envs", "make"),
+    "record": ("pcil.demos", "record"),
+    "train": ("pcil.runs", "train"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'pcil' has no attribute {name!r}")
+    module, attribute = _HOME[name]
+    return getattr(importlib.import_module(module), attribute)

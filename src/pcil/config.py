@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import tyro
+
 from pcil.agents import Agent, DrQV2
 from pcil.rewards import PCIL, Reward
 from pcil.types import InputError
@@ -27,7 +29,7 @@ class Method:
 class Run:
     """Every setting of a run. Frames are environment control steps: agent steps times the action repeat."""
 
-    task: str
+    task: tyro.conf.Positional[str]
     """One of the ten tasks (walker_walk), another dm_control suite task, or any Gymnasium id."""
     method: str = "pcil"
     """Name of the method; it chooses the reward and its settings."""

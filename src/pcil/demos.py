@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import re
 import tempfile
@@ -14,7 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.wrappers import FlattenObservation, RescaleAction
+from gymnasium.envs.registration import EnvSpec, registry
 from jaxtyping import Float
 
 from pcil import seeds
@@ -39,19 +40,17 @@ class Demonstrations:
 
     @classmethod
     def load(cls, spec: str | Path) -> Demonstrations:
-        """The demonstrations that `spec` names; `InputError` says in one sentence what is wrong with it or with them.
+        """The demonstrations that `spec` names; `InputError` says what is wrong with it or with them.
 
         `spec` is, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the path of a
         Minari dataset folder (or of the `data` folder in it), the id of a dataset in the user's local Minari root.
-        Dict observations are flattened as Gymnasium's FlattenObservation does it, and actions are brought from the
-        dataset's Box to [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes `info`.
+        Dict observations are flattened as FlattenObservation does it, and actions are brought from the dataset's Box to
+        [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes its `info`.
         """
         data = _find(spec)
-        metadata, episodes = _read(data)
+        task, episodes, info = _read(data)
         _check(episodes, str(data))
-        environment = json.loads(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", str(spec))
-        own = {"task": _task(environment), "info": metadata} | metadata.get("pcil", {})
-        return cls(own["task"], tuple(episodes), own["info"])
+        return cls(task, tuple(episodes), info)
 
     @property
     def num_steps(self) -> int:
@@ -93,11 +92,8 @@ class Demonstrations:
         return digest.hexdigest()
 
     def validate(self, spec: Spec | None) -> Demonstrations:
-        """These demonstrations, if something can be learned from them in the environment of `spec`.
-
-        `InputError` refuses no episodes, values that are not finite, actions out of [-1, 1] and shapes that differ from
-        the environment's (from the first episode's, if `spec` is None).
-        """
+        """These demonstrations; `InputError` if there are none, if values are not finite, if actions leave [-1, 1], or
+        if shapes differ from those of the environment's `spec` (from the first episode's, if that is None)."""
         _check(self.episodes, f"the demonstrations of {self.task}", spec)
         return self
 
@@ -117,23 +113,27 @@ class Demonstrations:
         """
         self.validate(None)
         folder = Path(path).expanduser().resolve()
-        dataset_id = _dataset_id(folder, dataset_id)
+        dataset_id = dataset_id or _dataset_id(folder)
+        if not re.fullmatch(r"([-\w]+/)*[-\w]+-v\d+", dataset_id):
+            raise InputError(f"{dataset_id!r} is no Minari dataset id: it must look like namespace/name-v0.")
         try:
-            if folder.exists() and (folder.is_file() or any(folder.iterdir())):
+            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
                 raise InputError(f"{folder} exists already: give a path where there is nothing yet.")
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
                 unfinished = Path(scratch) / "dataset"
                 self._write(unfinished / "data", dataset_id)
                 unfinished.rename(folder)
-        except (OSError, TypeError) as error:
-            wanted = "the place must be writable and the info must be JSON"
-            raise InputError(f"{folder} can not be written ({_reason(error)}): {wanted}.") from error
+        except (OSError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{folder} can not be written ({_reason(error)}): the place must be writable, the info JSON."
+            ) from error
         return folder
 
     def _write(self, data: Path, dataset_id: str) -> None:
         """Write `metadata.json` and `main_data.hdf5` into the new folder `data`, by Minari's own hand."""
         import minari
+        from minari.data_collector import EpisodeBuffer
         from minari.dataset.minari_storage import MinariStorage
 
         data.mkdir(parents=True)
@@ -146,13 +146,13 @@ class Demonstrations:
         storage.update_metadata(known | described | {"pcil": {"task": self.task, "info": self.info}})
         for episode in self.episodes:
             last = np.arange(len(episode)) == len(episode) - 1
-            buffer = minari.data_collector.EpisodeBuffer(
+            buffer = EpisodeBuffer(
                 seed=episode.seed,
-                observations=episode.obs.astype(np.float32),
-                actions=episode.action.astype(np.float32),
-                rewards=episode.reward,
-                terminations=last & episode.terminated,
-                truncations=last & (not episode.terminated),
+                observations=list(episode.obs.astype(np.float32)),
+                actions=list(episode.action.astype(np.float32)),
+                rewards=list(episode.reward),
+                terminations=list(last & episode.terminated),
+                truncations=list(last & (not episode.terminated)),
             )
             storage.update_episodes([buffer])
 
@@ -206,20 +206,14 @@ def shipped_tasks() -> list[str]:
 
 def shipped() -> list[dict[str, Any]]:
     """One row for each shipped dataset, read from the data itself except for what only `info` knows (else None)."""
-    return [
-        {
-            "task": demos.task,
-            "observation_dim": demos.obs.shape[1],
-            "action_dim": demos.action.shape[1],
-            "episodes": len(demos.episodes),
-            "steps": demos.num_steps,
-            "return_mean": demos.return_mean,
-            "return_std": demos.return_std,
-            **{key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")},
-            "hash": demos.hash,
-        }
-        for demos in map(Demonstrations.load, shipped_tasks())
-    ]
+    rows = []
+    for demos in map(Demonstrations.load, shipped_tasks()):
+        dims = {"observation_dim": demos.obs.shape[1], "action_dim": demos.action.shape[1]}
+        counts = {"episodes": len(demos.episodes), "steps": demos.num_steps}
+        returns = {"return_mean": demos.return_mean, "return_std": demos.return_std}
+        told = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
+        rows.append({"task": demos.task, **dims, **counts, **returns, **told, "hash": demos.hash})
+    return rows
 
 
 def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -> None:
@@ -230,8 +224,7 @@ def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -
     obs_dim, action_dim = (spec.obs_dim, spec.action_dim) if spec else (first.obs.shape[-1], first.action.shape[-1])
     for index, episode in enumerate(episodes):
         where, steps = f"Episode {index} of {source}", len(episode)
-        shapes = {"obs": (steps + 1, obs_dim), "action": (steps, action_dim), "reward": (steps,)}
-        for name, shape in shapes.items():
+        for name, shape in (("obs", (steps + 1, obs_dim)), ("action", (steps, action_dim)), ("reward", (steps,))):
             array = getattr(episode, name)
             if array.shape != shape:
                 whose = "in this environment" if spec else "after the first episode"
@@ -240,10 +233,7 @@ def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -
                 raise InputError(f"{where} has NaN or infinite values in {name}, but all must be finite.")
         low, high = float(episode.action.min()), float(episode.action.max())
         if max(-low, high) > 1 + ACTION_TOLERANCE:
-            raise InputError(
-                f"{where} has actions from {low:.7g} to {high:.7g}, but they must lie in [-1, 1] (a dataset's own "
-                f"action bounds are brought there first)."
-            )
+            raise InputError(f"{where} has actions from {low:.7g} to {high:.7g}, but their bounds are [-1, 1].")
 
 
 def _find(spec: str | Path) -> Path:
@@ -255,50 +245,44 @@ def _find(spec: str | Path) -> Path:
         for data in (place / "data", place):
             if (data / "metadata.json").is_file():
                 return data
-    if there := [place for place in places if place.exists()]:
-        raise InputError(f"{there[0]} is no Minari dataset folder: it must hold data/metadata.json, but does not.")
     raise InputError(
-        f"There are no demonstrations {str(spec)!r}: give a shipped task ({', '.join(names) or 'none ship'}), the "
-        f"path of a Minari dataset folder, or the id of a dataset below {places[1]}."
+        f"There is no Minari dataset (a folder with data/metadata.json) {str(spec)!r}: give a shipped task "
+        f"({', '.join(names) or 'none ship'}), the path of such a folder, or an id below {_minari_root()}."
     )
 
 
-def _read(data: Path) -> tuple[dict[str, Any], list[Episode]]:
-    """Metadata and episodes of a dataset, in any format that Minari can read here."""
+def _read(data: Path) -> tuple[str, list[Episode], dict[str, Any]]:
+    """Task, episodes and info of a dataset, in any format that Minari can read here."""
+    import h5py
     from minari.dataset.minari_storage import MinariStorage
 
-    where, episodes = str(data / "metadata.json"), []
+    where, episodes = str(data), []
     try:
         metadata = json.loads((data / "metadata.json").read_bytes())
-        count, steps = metadata["total_episodes"], metadata["total_steps"]
+        environment = json.loads(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", data.name)
+        own = {"task": _task(environment), "info": metadata} | metadata.get("pcil", {})
         # Were the spaces missing, Minari would make the environment, and so run whatever code the file names.
         spaces = [json.loads(metadata[key]) for key in ("observation_space", "action_space")]
-        where, indices = str(data), range(count)
+        indices, steps = range(metadata["total_episodes"]), metadata["total_steps"]
+        if not indices:
+            return own["task"], [], own["info"]
         if metadata["data_format"] == "hdf5":
-            _check_hdf5(data / "main_data.hdf5", count)
+            if not h5py.is_hdf5(file := data / "main_data.hdf5"):
+                raise ValueError(f"{file.name} is {'not an HDF5 file' if file.exists() else 'missing'}")
+            with h5py.File(file) as groups:
+                if len(groups) != len(indices):
+                    raise ValueError(f"{file.name} has {len(groups)} episodes, metadata.json says {len(indices)}")
         storage = MinariStorage.read(data)
+        where = f"Episode 0 of {data}"
         for raw, known in zip(storage.get_episodes(indices), storage.get_episode_metadata(indices), strict=True):
-            where = f"Episode {len(episodes)} of {data}"
             episodes.append(_episode(raw, known.get("seed"), *spaces))
-        where = str(data)
-        if sum(map(len, episodes)) != steps:
-            raise ValueError(f"metadata.json promises {steps} steps, but there are {sum(map(len, episodes))}")
+            where = f"Episode {len(episodes)} of {data}"
+        where, found = str(data), sum(map(len, episodes))
+        if found != steps:
+            raise ValueError(f"there are {found} steps in all, metadata.json says {steps}")
     except Exception as error:  # a damaged file may make json, h5py and Minari raise anything
-        wanted = "it must be a whole dataset as Minari writes it"
-        raise InputError(f"{where} can not be read ({_reason(error)}): {wanted}.") from error
-    return metadata, episodes
-
-
-def _check_hdf5(file: Path, count: int) -> None:
-    """Refuse, before Minari reads it, a file that is none, or that holds more or fewer than `count` episodes."""
-    import h5py
-
-    if count and not h5py.is_hdf5(file):
-        raise ValueError(f"{file.name} is {'not an HDF5 file' if file.exists() else 'missing'}")
-    if count:
-        with h5py.File(file) as groups:
-            if len(groups) != count:
-                raise ValueError(f"metadata.json promises {count} episodes, but {file.name} holds {len(groups)}")
+        raise InputError(f"{where} is not as Minari writes it and can not be read: {_reason(error)}.") from error
+    return own["task"], episodes, own["info"]
 
 
 def _episode(raw: dict[str, Any], seed: int | None, observation_space: dict, action_space: dict) -> Episode:
@@ -309,13 +293,12 @@ def _episode(raw: dict[str, Any], seed: int | None, observation_space: dict, act
     obs, stored = _flat(raw["observations"], observation_space), _flat(raw["actions"], action_space)
     action = (stored - (high + low) / 2) / ((high - low) / 2)
     reward, *flags = (np.asarray(raw[key]) for key in ("rewards", "terminations", "truncations"))
+    reward_type = np.float32 if reward.dtype == np.float32 else np.float64
+    reward = _flat(reward, {"type": "Box", "shape": []})[:, 0].astype(reward_type)
     steps, lengths = len(action), (len(obs), len(reward), *map(len, flags))
     if steps == 0 or lengths != (steps + 1, steps, steps, steps):
-        raise ValueError(
-            f"{steps} actions need {steps + 1} observations and {steps} rewards, terminations and truncations, "
-            f"at least 1 of each, but there are {lengths}"
-        )
-    reward = reward.astype(np.float32 if reward.dtype == np.float32 else np.float64)
+        given = "{} observations, {} rewards, {} terminations and {} truncations".format(*lengths)
+        raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {steps} actions with {given}")
     with np.errstate(over="ignore"):  # what is too large becomes infinite here, and is refused as such
         return Episode(obs.astype(np.float32), action.astype(np.float32), reward, bool(flags[0][-1]), seed)
 
@@ -327,23 +310,25 @@ def _flat(values: Any, space: dict[str, Any]) -> Float[np.ndarray, "T dim"]:
     if space["type"] != "Box":
         raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box")
     if values.dtype.kind not in "fiub" or list(values.shape[1:]) != space["shape"]:
-        raise ValueError(f"{values.dtype} {values.shape[1:]} is stored where the space has numbers {space['shape']}")
-    return values.reshape(len(values), -1 if len(values) else 0).astype(np.float64)
+        raise ValueError(f"{values.dtype} {values.shape[1:]} is stored where there must be numbers {space['shape']}")
+    return values.reshape(len(values), math.prod(space["shape"])).astype(np.float64)
 
 
 def _task(name: str) -> str:
     """The task that "dmc/<task>-v0" (an environment) or "dmc/<task>/expert-v0" (a dataset) names; else `name`."""
-    match = re.fullmatch(r"dmc/(\w+?)(/expert)?-v0", name)
-    return match[1] if match else name
+    return re.sub(r"\Admc/(\w+?)(/expert)?-v0\Z", r"\1", name)
 
 
 def _env_spec(task: str) -> EnvSpec | None:
     """What Gymnasium has registered for `task`, with the wrappers that make it flat and its actions [-1, 1]."""
-    known = [gymnasium.registry[name] for name in (f"dmc/{task}-v0", task) if name in gymnasium.registry]
-    if not known or not isinstance(known[0].entry_point, str):
+    known = next((registry[name] for name in (f"dmc/{task}-v0", task.rpartition(":")[2]) if name in registry), None)
+    if known is None or not isinstance(known.entry_point, str):
         return None
-    wrappers = (FlattenObservation.wrapper_spec(), RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0))
-    return known[0] if known[0].namespace == "dmc" else dataclasses.replace(known[0], additional_wrappers=wrappers)
+    if known.namespace in ("dmc", "toy"):  # these are so by themselves
+        return known
+    flatten = gymnasium.wrappers.FlattenObservation.wrapper_spec()
+    rescale = gymnasium.wrappers.RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0)
+    return dataclasses.replace(known, additional_wrappers=(flatten, rescale))
 
 
 def _minari_root() -> Path:
@@ -351,20 +336,16 @@ def _minari_root() -> Path:
     return Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser()
 
 
-def _dataset_id(folder: Path, wanted: str | None) -> str:
-    """`wanted`, or the path below a Minari root, or the folder's name made into an id."""
-    from minari.dataset.minari_dataset import DATASET_ID_RE
-
-    roots = [root.resolve() for root in (SHIPPED, _minari_root()) if folder.is_relative_to(root.resolve())]
-    name = re.sub(r"[^-\w]+|(-v\d+)$", "_", folder.name)  # noqa
-    dataset_id = wanted or (folder.relative_to(roots[0]).as_posix() if roots else name)
-    match = DATASET_ID_RE.fullmatch(dataset_id)
-    if match is None or match["version"] is None:
-        raise InputError(f"{dataset_id!r} is no Minari dataset id: it must look like namespace/name-v0.")
-    return dataset_id
+def _dataset_id(folder: Path) -> str:
+    """The path below a Minari root, as Minari wants it; elsewhere the folder's name, made into an id."""
+    for root in (SHIPPED.resolve(), _minari_root().resolve()):
+        if folder.is_relative_to(root):
+            return folder.relative_to(root).as_posix()
+    return re.sub(r"[^-\w]+", "_", re.sub(r"-v\d+$", "", folder.name)) + "-v0"
 
 
 def _reason(error: Exception) -> str:
     """What a library said, without line breaks and full stops, to go into a sentence of ours."""
     text = str(error.args[0] if isinstance(error, KeyError) else error).strip() or type(error).__name__
+    text = f"there is no {text!r}" if isinstance(error, KeyError) and " " not in text else text
     return re.sub(r"[.!?]?\s*\n.*|[.!?]$", "", text, flags=re.DOTALL).replace(". ", "; ")

@@ -29,9 +29,7 @@ class Evaluation:
         return float(np.mean(self.returns))
 
 
-def evaluate(
-    act: Callable[[np.ndarray], np.ndarray], environments: Sequence[gymnasium.Env], *, seed: int
-) -> Evaluation:
+def evaluate(act: Callable[[np.ndarray], np.ndarray], environments: Sequence[gymnasium.Env], *, seed: int) -> Evaluation:
     """One episode in each of `environments`; `act` maps observations `[k, obs]` of those still running to `[k, action]`.
 
     Episode `i` starts from a seed that depends on `seed` and `i` alone, so every evaluation of a run meets the same starts.
@@ -43,7 +41,7 @@ def evaluate(
     running = np.arange(num)
     while len(running):
         over = np.zeros(len(running), bool)
-        for k, (i, action) in enumerate(zip(running, act(obs[running]), strict=True)):
+        for k, (i, action) in enumerate(zip(running.tolist(), act(obs[running]), strict=True)):
             obs[i], reward, terminated, truncated, _ = environments[i].step(action)
             returns[i] += float(reward)
             lengths[i] += 1

@@ -37,9 +37,7 @@ def init(method: Method, spec: Spec, demos: Batch, seed: int) -> Learner:
     agent = method.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
     reward = method.reward.init(demos, frozen_embed(method, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
-    window = Window(
-        *(jnp.zeros((method.agent.batch_size, *tail)) for tail in _window_shapes(method.agent.n_step, spec))
-    )
+    window = Window(*(jnp.zeros((method.agent.batch_size, *tail)) for tail in _window_shapes(method.agent.n_step, spec)))
     expert = Batch(*(jnp.zeros((method.reward.batch_size, size)) for size in (spec.obs_dim, spec.action_dim)))
     metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, jnp.int32(0), jnp.int32(0))[1]
     return eqx.tree_at(lambda s: s.totals, learner, {name: jnp.zeros(()) for name in [*sorted(metrics), "updates"]})
@@ -51,9 +49,7 @@ def frozen_embed(method: Method, agent: Any) -> Any:
 
 
 @functools.partial(jax.jit, static_argnames="method", donate_argnames="learner")
-def update(
-    method: Method, learner: Learner, window: Window, expert: Batch, step: Array, count: Array
-) -> tuple[Learner, Actor]:
+def update(method: Method, learner: Learner, window: Window, expert: Batch, step: Array, count: Array) -> tuple[Learner, Actor]:
     """One update of the reward, then of the agent; `step` counts agent steps and `count` updates, both from 0.
 
     The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
@@ -74,9 +70,7 @@ def _step(
     seen = Batch(window.obs[:rows, 0], window.action[:rows, 0])
     reward_state, reward_metrics = method.reward.update(learner.reward, expert, seen, embed, key=reward_key)
     if method.label == "sampled":
-        fresh = label(
-            method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key
-        )
+        fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
     agent_state, agent_metrics = method.agent.update(learner.agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import jax
@@ -24,6 +24,7 @@ from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec
 
 
+@runtime_checkable
 class Reporter(Protocol):
     """Who is told how a run goes: a progress bar, or nobody. `stop` is asked between episodes."""
 

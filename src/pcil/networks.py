@@ -5,60 +5,75 @@ Weights are `[in, out]`. Every linear layer starts orthogonal with gain 1 and bi
 
 from __future__ import annotations
 
+import itertools
 from types import ModuleType
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 LAYER_NORM_EPSILON = 1e-5
 
 
-def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Array, "in out"]:
+def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Any, "in out"]:
     """A random matrix with orthonormal rows or columns, whichever are fewer."""
     return jax.nn.initializers.orthogonal()(key, shape, jnp.float32)
+
+
+def _rows(vector: Float[Any, " dim"], x: Float[Any, "*batch dim"]) -> Float[Any, "*ones dim"]:
+    """`vector` with as many axes as `x`, so that no rank is promoted silently."""
+    return vector.reshape((1,) * (x.ndim - 1) + vector.shape)
+
+
+def _add(x: Float[Any, "*batch dim"], bias: Float[Any, " dim"]) -> Float[Any, "*batch dim"]:
+    return x + _rows(bias, x)
 
 
 class MLP(eqx.Module):
     """Linear layers with ReLU between them; the last layer is linear."""
 
-    weights: tuple[Float[Array, "in out"], ...]
-    biases: tuple[Float[Array, " out"], ...]
+    weights: tuple[Float[Any, "_ _"], ...]
+    biases: tuple[Float[Any, " _"], ...]
 
     @classmethod
     def init(cls, sizes: tuple[int, ...], *, key: PRNGKeyArray) -> MLP:
         """`sizes` = input, hidden ..., output."""
         keys = jax.random.split(key, len(sizes) - 1)
-        shapes = list(zip(sizes[:-1], sizes[1:], strict=True))
+        shapes = list(itertools.pairwise(sizes))
         weights = tuple(orthogonal(k, shape) for k, shape in zip(keys, shapes, strict=True))
         return cls(weights, tuple(jnp.zeros(out) for _, out in shapes))
 
-    def __call__(self, x: Float[Array, "*batch in"], xp: ModuleType = jnp) -> Float[Array, "*batch out"]:
+    def __call__(self, x: Float[Any, "*batch in"], xp: ModuleType = jnp) -> Float[Any, "*batch out"]:
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = xp.maximum(x @ weight + bias, 0)
-        return x @ self.weights[-1] + self.biases[-1]
+            x = xp.maximum(_add(x @ weight, bias), 0)
+        return _add(x @ self.weights[-1], self.biases[-1])
 
 
 class Trunk(eqx.Module):
     """Linear, layer normalisation, tanh: observations to features in (-1, 1) (DrQ-v2 on states; `algorithms` section 2.1)."""
 
-    weight: Float[Array, "obs features"]
-    bias: Float[Array, " features"]
-    scale: Float[Array, " features"]
-    offset: Float[Array, " features"]
+    weight: Float[Any, "obs features"]
+    bias: Float[Any, " features"]
+    scale: Float[Any, " features"]
+    offset: Float[Any, " features"]
 
     @classmethod
     def init(cls, obs_dim: int, feature_dim: int, *, key: PRNGKeyArray) -> Trunk:
         return cls(
-            orthogonal(key, (obs_dim, feature_dim)), jnp.zeros(feature_dim), jnp.ones(feature_dim), jnp.zeros(feature_dim)
+            orthogonal(key, (obs_dim, feature_dim)),
+            jnp.zeros(feature_dim),
+            jnp.ones(feature_dim),
+            jnp.zeros(feature_dim),
         )
 
-    def __call__(self, obs: Float[Array, "*batch obs"], xp: ModuleType = jnp) -> Float[Array, "*batch features"]:
-        x = obs @ self.weight + self.bias
+    def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch features"]:
+        x = _add(obs @ self.weight, self.bias)
         centred = x - x.mean(axis=-1, keepdims=True)
         variance = (centred * centred).mean(axis=-1, keepdims=True)
-        return xp.tanh(centred / xp.sqrt(variance + LAYER_NORM_EPSILON) * self.scale + self.offset)
+        normal = centred / xp.sqrt(variance + LAYER_NORM_EPSILON)
+        return xp.tanh(_add(normal * _rows(self.scale, normal), self.offset))
 
 
 class Actor(eqx.Module):
@@ -73,7 +88,7 @@ class Actor(eqx.Module):
         head = MLP.init((feature_dim, hidden, hidden, action_dim), key=head_key)
         return cls(Trunk.init(obs_dim, feature_dim, key=trunk_key), head)
 
-    def __call__(self, obs: Float[Array, "*batch obs"], xp: ModuleType = jnp) -> Float[Array, "*batch action"]:
+    def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch action"]:
         return xp.tanh(self.head(self.trunk(obs, xp), xp))
 
 
@@ -91,19 +106,19 @@ class Critic(eqx.Module):
         return cls(Trunk.init(obs_dim, feature_dim, key=trunk_key), (first, second))
 
     def __call__(
-        self, obs: Float[Array, "*batch obs"], action: Float[Array, "*batch action"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        self, obs: Float[Any, "*batch obs"], action: Float[Any, "*batch action"]
+    ) -> tuple[Float[Any, "*batch"], Float[Any, "*batch"]]:
         return self.values(self.trunk(obs), action)
 
     def values(
-        self, features: Float[Array, "*batch features"], action: Float[Array, "*batch action"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+        self, features: Float[Any, "*batch features"], action: Float[Any, "*batch action"]
+    ) -> tuple[Float[Any, "*batch"], Float[Any, "*batch"]]:
         """Both values from features of the trunk."""
         x = jnp.concatenate([features, action], axis=-1)
         first, second = (head(x)[..., 0] for head in self.heads)
         return first, second
 
 
-def unit_sphere(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+def unit_sphere(x: Float[Any, "*batch dim"]) -> Float[Any, "*batch dim"]:
     """Each row scaled to length 1, with a finite gradient at 0."""
     return x / jnp.sqrt(jnp.sum(x * x, axis=-1, keepdims=True) + 1e-12)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 ACTION_MARGIN = 1e-6
 """Sampled actions stay this far inside (-1, 1) (authors' code: utils.py, `TruncatedNormal`)."""
@@ -21,14 +22,14 @@ class LinearSchedule:
     end: float = 0.1
     steps: int = 500_000
 
-    def __call__(self, step: Array | int, xp: ModuleType = jnp) -> Float[Array, ""]:
-        mix = xp.clip(step / xp.float32(max(self.steps, 1)), 0.0, 1.0)
+    def __call__(self, step: Any, xp: ModuleType = jnp) -> Float[Any, ""]:
+        mix = xp.clip(xp.float32(step) / xp.float32(max(self.steps, 1)), 0.0, 1.0)
         return xp.float32(self.start) * (1 - mix) + xp.float32(self.end) * mix
 
 
 def perturb(
-    mean: Float[Array, "*batch action"], noise: Float[Array, "*batch action"], xp: ModuleType = jnp
-) -> Float[Array, "*batch action"]:
+    mean: Float[Any, "*batch action"], noise: Float[Any, "*batch action"], xp: ModuleType = jnp
+) -> Float[Any, "*batch action"]:
     """`mean + noise`, clamped into the action range; the clamp passes the gradient of `mean` through unchanged."""
     raw = mean + noise
     clamped = xp.clip(raw, ACTION_MARGIN - 1, 1 - ACTION_MARGIN)

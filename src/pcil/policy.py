@@ -29,13 +29,15 @@ class Policy:
     @property
     def spec(self) -> Spec:
         """Sizes of observation and action."""
-        return Spec(self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0], self.info.get("action_repeat", 1))
+        obs_dim, action_dim = self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0]
+        return Spec(obs_dim, action_dim, self.info.get("action_repeat", 1))
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         obs = np.asarray(obs, np.float32)
         if obs.shape[-1:] != (self.spec.obs_dim,):
             raise InputError(
-                f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers; got an array of shape {obs.shape}."
+                f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers; "
+                f"got an array of shape {obs.shape}."
             )
         return self.actor(obs, np)
 
@@ -63,13 +65,17 @@ def load_policy(path: str | Path) -> Policy:
     folder = Path(path)
     folder = folder / "policy" if (folder / "policy").is_dir() else folder
     if not (folder / "policy.json").is_file() or not (folder / "policy.safetensors").is_file():
-        raise InputError(f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made.")
+        raise InputError(
+            f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made."
+        )
     try:
         header = json.loads((folder / "policy.json").read_text())
         arrays = load_file(folder / "policy.safetensors")
         actor = _build(header, arrays)
     except (ValueError, KeyError, TypeError, AttributeError, SafetensorError, OSError) as error:
-        raise InputError(f"The policy in {folder} is damaged ({type(error).__name__}: {error}); train or copy it again.") from error
+        raise InputError(
+            f"The policy in {folder} is damaged ({type(error).__name__}: {error}); train or copy it again."
+        ) from error
     return Policy(actor, header["task"], header.get("info", {}))
 
 

@@ -96,7 +96,7 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     """The run of a method with a preset, and any field of `Run` changed; unknown names raise `InputError`."""
     _known("method", method, REWARDS)
     _known("preset", preset, PRESETS)
-    settings = PRESETS[preset](task) | {"reward": REWARD_SETTINGS[method, preset]} | changes
+    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": REWARD_SETTINGS[method, preset], **changes}
     return Run(task=task, method=method, preset=preset, **settings)
 
 

@@ -1,4 +1,4 @@
-"""Run folders: who may write there, what `run.json` says, when a run is done; and `train`, the call that starts or resumes one."""
+"""Run folders: who may write there, what `run.json` says, when a run is done; and `train`, which starts or resumes one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pcil import envs, loop, presets
+from pcil import compilation, envs, loop, presets
 from pcil.config import Run, differences
 from pcil.demos import Demonstrations
 from pcil.evaluate import Evaluation
@@ -78,11 +78,8 @@ def train(
 
 def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
-    environment = envs.make(run.task)
+    compilation.use_cache()
     demos = demonstrations(run)
-    if demos is not None:
-        demos.validate(envs.spec(environment))
-    environment.close()
     with _claimed(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
@@ -94,10 +91,11 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
 
 
 def demonstrations(run: Run) -> Demonstrations | None:
-    """What the run imitates, or None where its reward needs no demonstrations."""
+    """What the run imitates, checked against its environment, or None where its reward needs no demonstrations."""
+    environment = envs.make(run.task)
     if not run.reward.needs_demos:
         return None
-    return Demonstrations.load(run.demos or run.task).take(run.num_demos)
+    return Demonstrations.load(run.demos or run.task).take(run.num_demos).validate(envs.spec(environment))
 
 
 def _batch(demos: Demonstrations | None, run: Run) -> Batch:
@@ -143,7 +141,9 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
         before = json.loads(path.read_text())
         changed = differences(before["run"], about["run"]) + differences(before["demos"] or {}, about["demos"] or {}, "demos.")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder.") from error
+        raise InputError(
+            f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder."
+        ) from error
     if changed:
         raise InputError(f"The folder {folder} holds another run: {'; '.join(changed)}; use its settings or another --out.")
     updated = differences(before.get("versions", {}), about["versions"])
@@ -164,6 +164,22 @@ def commit() -> str | None:
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", ".") else "")
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+def provenance(folder: Path, policy: Policy, command: str) -> dict[str, Any]:
+    """Where demonstrations recorded from a policy come from; the settings are those of its run, where they are known."""
+    frames, seed = policy.info.get("frames"), policy.info.get("seed")
+    path = folder / "run.json"
+    trained = json.loads(path.read_text()) if path.exists() else {}
+    return {
+        "expert": f"{policy.info.get('method', 'policy')}, {frames} frames, seed {seed}",
+        "command": command,
+        "frames": frames,
+        "seed": seed,
+        "commit": trained.get("commit"),
+        "run": trained.get("run"),
+        "versions": trained.get("versions"),
+    }
 
 
 def _write(path: Path, text: str) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Float, Shaped
 
-
-class InputError(Exception):
-    """Something that a person gave is wrong. The command line prints it as one sentence and exits with code 2."""
+from pcil.errors import InputError
 
 
 class Spec(NamedTuple):
@@ -25,8 +23,8 @@ class Spec(NamedTuple):
 class Batch(NamedTuple):
     """States and the actions taken in them, row by row: `obs[i]` is where `action[i]` was taken."""
 
-    obs: Float[Array | np.ndarray, "batch obs"]
-    action: Float[Array | np.ndarray, "batch action"]
+    obs: Float[Any, "batch obs"]
+    action: Float[Any, "batch action"]
 
 
 class Window(NamedTuple):
@@ -37,10 +35,10 @@ class Window(NamedTuple):
     window reaches past one.
     """
 
-    obs: Float[Array | np.ndarray, "batch n+1 obs"]
-    action: Float[Array | np.ndarray, "batch n action"]
-    reward: Float[Array | np.ndarray, "batch n"]
-    discount: Float[Array | np.ndarray, "batch n"]
+    obs: Float[Any, "batch states obs"]
+    action: Float[Any, "batch n action"]
+    reward: Float[Any, "batch n"]
+    discount: Float[Any, "batch n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +49,7 @@ class Episode:
     ended (no future), otherwise the episode was cut by a time limit. `seed` is what the environment was reset with.
     """
 
-    obs: Float[np.ndarray, "T+1 obs"]
+    obs: Float[np.ndarray, "states obs"]
     action: Float[np.ndarray, "T action"]
     reward: Shaped[np.ndarray, " T"]
     terminated: bool = False

@@ -19,6 +19,11 @@ Metrics = dict[str, Float[Array, ""]]
 class Agent(abc.ABC):
     """Settings of an agent; all that changes is in the state, a pytree that goes in and comes out."""
 
+    batch_size: int = 128
+    """Windows in one update."""
+    n_step: int = 3
+    """Steps of reward before the target bootstraps: the length of a window."""
+
     @abc.abstractmethod
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> Any:
         """The state before the first update."""

@@ -5,19 +5,19 @@ Facts and sources: the authors' drqv2.py; `docs/methods/drqv2.md` lists where we
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Metrics
 from pcil.losses import n_step_target
 from pcil.networks import Actor, Critic
 from pcil.noise import LinearSchedule, perturb
+from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
 
@@ -27,18 +27,14 @@ class DrQV2State(eqx.Module):
     actor: Actor
     critic: Critic
     critic_target: Critic
-    actor_moments: optax.OptState
-    critic_moments: optax.OptState
+    actor_moments: Moments
+    critic_moments: Moments
 
 
 @dataclass(frozen=True)
 class DrQV2(Agent):
     """Settings of the agent."""
 
-    batch_size: int = 128
-    """Windows in one update."""
-    n_step: int = 3
-    """Steps of reward before the target bootstraps."""
     gamma: float = 0.99
     """Discount for each agent step."""
     learning_rate: float = 1e-4
@@ -49,7 +45,7 @@ class DrQV2(Agent):
     """Width of the trunk."""
     hidden: int = 256
     """Width of the two hidden layers of actor and critic."""
-    noise: LinearSchedule = LinearSchedule()
+    noise: LinearSchedule = field(default_factory=LinearSchedule)
     """Standard deviation of the exploration noise over agent steps."""
     noise_clip: float = 0.3
     """Bound on the noise of the actions inside the updates; acting has no bound."""
@@ -59,11 +55,14 @@ class DrQV2(Agent):
         actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=actor_key)
         critic = Critic.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=critic_key)
         target = jax.tree.map(jnp.copy, critic)
-        adam = optax.adam(self.learning_rate)
-        return DrQV2State(actor, critic, target, adam.init(actor), adam.init(critic))
+        return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic))
 
     def critic_loss(
-        self, critic: Critic, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"], target: Float[Array, " batch"]
+        self,
+        critic: Critic,
+        obs: Float[Array, "batch obs"],
+        action: Float[Array, "batch action"],
+        target: Float[Array, " batch"],
     ) -> tuple[Float[Array, ""], Metrics]:
         """Squared distance of both values to the target, summed over the two, averaged over the batch."""
         first, second = critic(obs, action)
@@ -85,20 +84,17 @@ class DrQV2(Agent):
 
     def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
         obs, action = window.obs[:, 0], window.action[:, 0]
-        adam = optax.adam(self.learning_rate)
         noise = self.noise(step) * jax.random.normal(key, (2, *action.shape))
         noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
 
         target = jax.lax.stop_gradient(self.target(state, window, noise[0]))
         gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
-        change, critic_moments = adam.update(gradient, state.critic_moments)
-        critic = optax.apply_updates(state.critic, change)
+        critic, critic_moments = adam_step(state.critic, gradient, state.critic_moments, self.learning_rate)
 
         loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1])
-        change, actor_moments = adam.update(gradient, state.actor_moments)
-        actor = optax.apply_updates(state.actor, change)
+        actor, actor_moments = adam_step(state.actor, gradient, state.actor_moments, self.learning_rate)
 
-        critic_target = optax.incremental_update(critic, state.critic_target, self.tau)
+        critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
         metrics |= {"actor_loss": loss}
         return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments), metrics
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from typing import NoReturn
+import warnings
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -69,13 +70,21 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
     own wrappers.
     """
     register()
+    env_id = _gymnasium_id(task)
+    if render_mode is not None and env_id in _TOYS:
+        raise InputError(f"{task!r} has no pictures; render_mode must be None.")
+    render: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
     try:
-        env = gymnasium.make(_gymnasium_id(task), render_mode=render_mode, disable_env_checker=True)
-    except gymnasium.error.UnregisteredEnv:
-        _refuse_name(task)
+        env = gymnasium.make(env_id, disable_env_checker=True, **render)
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise InputError(f"The environment {task!r} needs a package that is not installed: {error}") from error
-    return _flat_actions(_flat_observations(env, task), task)
+    except gymnasium.error.Error as error:
+        if env_id.rpartition(":")[2] not in gymnasium.registry:
+            _refuse_name(task, error)
+        raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
+        return _flat_actions(_flat_observations(env, task), task)
 
 
 def spec(env: gymnasium.Env) -> Spec:
@@ -84,7 +93,7 @@ def spec(env: gymnasium.Env) -> Spec:
 
     inner = env.unwrapped
     action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
-    return Spec(env.observation_space.shape[0], env.action_space.shape[0], action_repeat)
+    return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
 
 
 def _gymnasium_id(task: str) -> str:
@@ -105,14 +114,14 @@ def _suite_tasks() -> list[str]:
     return [f"{domain}_{name}" for domain, name in import_suite().ALL_TASKS]
 
 
-def _refuse_name(task: str) -> NoReturn:
+def _refuse_name(task: str, error: Exception) -> NoReturn:
     known = [*TASKS, *gymnasium.registry, *_suite_tasks()]
     near = difflib.get_close_matches(task, known, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     raise InputError(
         f"There is no environment {task!r}{hint}: give one of {', '.join(TASKS)}, another task of DeepMind Control's "
         "suite, or any Gymnasium id."
-    )
+    ) from error
 
 
 def _flat_observations(env: gymnasium.Env, task: str) -> gymnasium.Env:
@@ -135,7 +144,8 @@ def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
         raise InputError(f"The actions of {task!r} must have finite bounds; they are {space}.")
     dtype = space.dtype
     if np.any(space.low != -1.0) or np.any(space.high != 1.0):
-        env = wrappers.RescaleAction(env, -1.0, 1.0)
+        one = np.ones(space.shape, dtype)
+        env = wrappers.RescaleAction(env, -one, one)
     if dtype != np.float32:
         box = spaces.Box(-1.0, 1.0, space.shape, np.float32)
         env = wrappers.TransformAction(env, lambda action: np.asarray(action, dtype), box)

@@ -38,6 +38,8 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Nothing here catches or hides a `dm_control.rl.control.PhysicsError`: a diverged simulation stops the run.
     """
 
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  as gymnasium.Env declares it
+
     def __init__(
         self,
         task: str,
@@ -52,14 +54,13 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, "rgb_array"):
             raise InputError(f'render_mode is None or "rgb_array" for DeepMind Control; got {render_mode!r}.')
         suite = import_suite()
-        if render_mode is not None:
+        if render_mode is not None or task == "quadruped_escape":  # which hands its terrain to OpenGL at each reset
             enable_rendering()
         self.name = task
         self._domain, self._task = split_name(task, suite.ALL_TASKS)
         self.action_repeat = action_repeat
         self.render_mode = render_mode
         self._camera = {"height": height, "width": width, "camera_id": camera_id}
-        self._random_model = False
         random = np.random.RandomState(0)
         self._load(random)
         # lqr draws its springs while it is loaded, so that there each episode needs a model of its own.
@@ -142,7 +143,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._action_low, self._action_scale = bounds.minimum, (bounds.maximum - bounds.minimum) / 2.0
         self._rescale = bool(np.any(bounds.minimum != -1.0) or np.any(bounds.maximum != 1.0))
         fps = 1.0 / (self._env.control_timestep() * self.action_repeat)
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(fps)}
+        self.metadata = {**DMCEnv.metadata, "render_fps": round(fps)}
 
     def _observation(self) -> np.ndarray:
         row = np.empty(self._obs_dim, np.float32)
@@ -167,30 +168,40 @@ def import_suite() -> ModuleType:
     Unless `MUJOCO_GL` says otherwise, dm_control looks for a window system while it is imported. We keep it from that
     for the length of the import; `enable_rendering` brings OpenGL in when someone asks for pictures.
     """
-    chosen = os.environ.setdefault("MUJOCO_GL", "disabled") if "dm_control._render" not in sys.modules else None
+    chosen = os.environ.get("MUJOCO_GL")
+    if chosen is None:
+        os.environ["MUJOCO_GL"] = "disabled"
     try:
         return importlib.import_module("dm_control.suite")
+    except (ImportError, AttributeError, OSError, RuntimeError) as error:
+        if chosen is None:
+            raise
+        raise _no_opengl(chosen) from error
     finally:
-        if chosen == "disabled":
+        if chosen is None:
             del os.environ["MUJOCO_GL"]
 
 
 def enable_rendering() -> None:
     """Gives dm_control a renderer that needs no display: the one that `MUJOCO_GL` names, else EGL, else OSMesa."""
-    render = importlib.import_module("dm_control._render")
+    render: Any = importlib.import_module("dm_control._render")
     name = os.environ.get("MUJOCO_GL", "").lower()
     if not name:
         name = "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
-    if name == render.BACKEND:
+    if name == render.BACKEND and name in _RENDERERS:
         return
     try:
         module, context = _RENDERERS[name]
         render.Renderer, render.BACKEND = getattr(importlib.import_module(module), context), name
     except (KeyError, ImportError, AttributeError, OSError, RuntimeError) as error:
-        raise InputError(
-            f"Rendering needs OpenGL and {name!r} does not work here: install EGL (apt install libegl1) and set the "
-            "environment variable MUJOCO_GL=egl, or OSMesa (apt install libosmesa6) and MUJOCO_GL=osmesa."
-        ) from error
+        raise _no_opengl(name) from error
+
+
+def _no_opengl(name: str) -> InputError:
+    return InputError(
+        f"Rendering needs OpenGL and MUJOCO_GL={name} does not work here: install EGL (apt install libegl1) and set the "
+        "environment variable MUJOCO_GL=egl, or OSMesa (apt install libosmesa6) and MUJOCO_GL=osmesa."
+    )
 
 
 def split_name(task: str, all_tasks: tuple[tuple[str, str], ...]) -> tuple[str, str]:
@@ -204,7 +215,8 @@ def split_name(task: str, all_tasks: tuple[tuple[str, str], ...]) -> tuple[str, 
 def advance_function(physics: Any, task: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
     """One control step: set the control signal, then the substeps in dm_control's order.
 
-    Made anew for each episode, whose beginning tells which of MuJoCo's warnings are new. A task that does more than that in a step is left to its own methods.
+    Made anew for each episode, whose beginning tells which of MuJoCo's warnings are new. A task that does more than
+    that in a step is left to its own methods.
     """
     from dm_control.mujoco import engine
     from dm_control.suite import base
@@ -228,8 +240,7 @@ def advance_function(physics: Any, task: Any, num_substeps: int) -> Callable[[np
 
 
 def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
-    import mujoco
-
+    mujoco: Any = importlib.import_module("mujoco")
     model, data = physics.model.ptr, physics.data.ptr
     control_signal, warnings, before = data.ctrl, data.warning.number, data.warning.number.tobytes()
     runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
@@ -252,9 +263,9 @@ def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], No
 
 def _raise_physics_error(raised: np.ndarray) -> None:
     """Raises dm_control's error if one of MuJoCo's warnings came up."""
-    import mujoco
     from dm_control.rl import control
 
+    mujoco: Any = importlib.import_module("mujoco")
     if names := [name for name, new in zip(mujoco.mjtWarning.__members__, raised, strict=False) if new]:
         raise control.PhysicsError(f"Physics state is invalid. Warning(s) raised: {', '.join(names)}")
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import time
 from collections.abc import Callable
 from statistics import median
+from typing import Any
 
 import numpy as np
 
-from pcil.envs import make
+from pcil.envs import make, spec
 from pcil.envs.dmc import DMCEnv
 from pcil.types import InputError
 
@@ -27,7 +29,7 @@ def measure_env(task: str, episodes: int = 3) -> dict[str, float]:
         raise InputError(f"Only tasks of DeepMind Control have bare physics to compare with; got {task!r}.")
     env_us, physics_us = [], []
     for episode in range(episodes):
-        actions = np.random.default_rng(episode).uniform(-1.0, 1.0, (10 * _BLOCK, *env.action_space.shape))
+        actions = np.random.default_rng(episode).uniform(-1.0, 1.0, (10 * _BLOCK, spec(env).action_dim))
         env.reset(seed=episode)
         run_physics = _bare_physics(env)
         for block in np.split(actions.astype(np.float32), 10):
@@ -51,8 +53,7 @@ def _microseconds(run: Callable[[], None]) -> float:
 
 def _bare_physics(env: DMCEnv) -> Callable[[list[np.ndarray]], None]:
     """MuJoCo's calls of one agent step after the other, from a copy of the environment's present state."""
-    import mujoco
-
+    mujoco: Any = importlib.import_module("mujoco")
     model, repeat = env.physics.model.ptr, range(env.action_repeat)
     data = mujoco.MjData(model)
     mujoco.mj_copyData(data, model, env.physics.data.ptr)

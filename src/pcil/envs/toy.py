@@ -7,7 +7,7 @@ observations.
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,10 +23,8 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
 
     SPEED = 0.1
     NUM_STEPS = 50
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
-    def __init__(self, render_mode: None = None) -> None:
-        self.render_mode = render_mode
+    def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._position, self._steps = np.zeros(2), 0
@@ -53,10 +51,7 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
 class Probe(gymnasium.Env[np.ndarray, np.ndarray]):
     """One number observed, one number acted; terminates after one step unless the probe says otherwise."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
-
-    def __init__(self, render_mode: None = None) -> None:
-        self.render_mode = render_mode
+    def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self._obs = np.zeros(1, np.float32)

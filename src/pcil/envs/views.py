@@ -64,8 +64,8 @@ def hopper(env: Any) -> Views:
     position, velocity, control, touch = data.qpos[1:], data.qvel, data.ctrl, sensors(env, "touch_toe", "touch_heel")
     torso, foot = data.xipos[model.body("torso").id, 2, ...], data.xipos[model.body("foot").id, 2, ...]
     speed = sensors(env, "torso_subtreelinvel")[0, ...]
-    hopping = linear_tolerance(suite._HOP_SPEED, suite._HOP_SPEED / 2, 0.5)
-    lowest = suite._STAND_HEIGHT
+    lowest, hop_speed = suite._STAND_HEIGHT, float(suite._HOP_SPEED)
+    hopping = linear_tolerance(hop_speed, hop_speed / 2, 0.5)
 
     def fill_observation(row: np.ndarray) -> None:
         row[0:6] = position
@@ -128,7 +128,8 @@ def cheetah_run(env: Any) -> Views:
 
     data = env.physics.data.ptr
     position, velocity, speed = data.qpos[1:], data.qvel, sensors(env, "torso_subtreelinvel")[0, ...]
-    running = linear_tolerance(cheetah._RUN_SPEED, cheetah._RUN_SPEED, 0)
+    run_speed = float(cheetah._RUN_SPEED)
+    running = linear_tolerance(run_speed, run_speed, 0.0)
 
     def fill_observation(row: np.ndarray) -> None:
         row[0:8] = position
@@ -146,7 +147,7 @@ def walker(env: Any) -> Views:
     orientations, velocity = data.xmat[1:, 0:3:2], data.qvel  # xx, xz of each body
     height, upright = data.xpos[torso, 2, ...], data.xmat[torso, 8, ...]
     speed = sensors(env, "torso_subtreelinvel")[0, ...]
-    lowest, margin, move_speed = suite._STAND_HEIGHT, suite._STAND_HEIGHT / 2, env.task._move_speed
+    lowest, margin, move_speed = suite._STAND_HEIGHT, suite._STAND_HEIGHT / 2, float(env.task._move_speed)
     moving = linear_tolerance(move_speed, move_speed / 2, 0.5)
 
     def fill_observation(row: np.ndarray) -> None:
@@ -173,8 +174,8 @@ def quadruped_run(env: Any) -> Views:
     upright = data.xmat[model.body("torso").id, 8, ...]
     imu = sensors(env, "imu_accel", "imu_gyro")
     force_torque = sensors(env, "force_toe_front_left", "torque_toe_back_left")
-    desired_speed = env.task._desired_speed
-    moving, standing = linear_tolerance(desired_speed, desired_speed, 0.5), linear_tolerance(1.0, 2.0, 0)
+    desired_speed = float(env.task._desired_speed)
+    moving, standing = linear_tolerance(desired_speed, desired_speed, 0.5), linear_tolerance(1.0, 2.0, 0.0)
 
     def fill_observation(row: np.ndarray) -> None:
         row[0:16] = joint_position

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.losses import binary_cross_entropy, gradient_penalty, interpolate
 from pcil.networks import MLP
+from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.types import Batch
 
@@ -23,7 +23,7 @@ class DiscriminatorState(eqx.Module):
     """The discriminator and its optimiser's moments."""
 
     discriminator: MLP
-    moments: optax.OptState
+    moments: Moments
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class DAC(Reward):
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
         features = jax.eval_shape(embed, jnp.asarray(demos.obs)).shape[-1]
         discriminator = MLP.init((features, self.hidden, self.hidden, 1), key=key)
-        return DiscriminatorState(discriminator, optax.adam(self.learning_rate).init(discriminator))
+        return DiscriminatorState(discriminator, adam_init(discriminator))
 
     def loss(
         self,
@@ -71,8 +71,7 @@ class DAC(Reward):
     ) -> tuple[DiscriminatorState, Metrics]:
         features = embed(jnp.asarray(expert.obs)), embed(jnp.asarray(agent.obs))
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *features, key=key)
-        change, moments = optax.adam(self.learning_rate).update(gradient, state.moments)
-        return DiscriminatorState(optax.apply_updates(state.discriminator, change), moments), metrics
+        return DiscriminatorState(*adam_step(state.discriminator, gradient, state.moments, self.learning_rate)), metrics
 
     def reward(
         self,

@@ -40,14 +40,18 @@ class Reward(abc.ABC):
         """The state before the first update; `demos` are all expert states and actions in the order of time."""
 
     @abc.abstractmethod
-    def update(
-        self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
-    ) -> tuple[Any, Metrics]:
+    def update(self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:
         """One gradient step on a batch of expert steps and one of agent steps."""
 
     @abc.abstractmethod
     def reward(
-        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: PRNGKeyArray
+        self,
+        state: Any,
+        obs: Float[Array, "T obs"],
+        action: Float[Array, "T action"],
+        embed: Embed,
+        *,
+        key: PRNGKeyArray,
     ) -> Float[Array, " T"]:
         """The reward of `T` steps; which state `obs` holds is said by `reads`."""
 
@@ -55,7 +59,7 @@ class Reward(abc.ABC):
 def label(
     settings: Reward,
     state: Any,
-    obs: Float[Array, "*batch n+1 obs"],
+    obs: Float[Array, "*batch states obs"],
     action: Float[Array, "*batch n action"],
     task_reward: Float[Array, "*batch n"],
     embed: Embed,

@@ -12,11 +12,11 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.losses import gradient_penalty, info_nce, interpolate
 from pcil.networks import MLP, unit_sphere
+from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.types import Batch
 
@@ -25,7 +25,7 @@ class PCILState(eqx.Module):
     """The encoder, its optimiser's moments, and the expert states that rewards compare with."""
 
     encoder: MLP
-    moments: optax.OptState
+    moments: Moments
     reference: Float[Array, "batch obs"]
     """The last batch of expert states: partners of the penalty and of the similarity reward."""
 
@@ -65,7 +65,7 @@ class PCIL(Reward):
         reference = jnp.asarray(demos.obs)[rows]
         features = jax.eval_shape(embed, reference).shape[-1]
         encoder = MLP.init((features, self.hidden, self.hidden, self.hidden, self.hidden // 4), key=encoder_key)
-        return PCILState(encoder, optax.adam(self.learning_rate).init(encoder), reference)
+        return PCILState(encoder, adam_init(encoder), reference)
 
     def loss(
         self,
@@ -104,8 +104,7 @@ class PCIL(Reward):
     ) -> tuple[PCILState, Metrics]:
         features = [embed(jnp.asarray(obs)) for obs in (expert.obs, agent.obs, state.reference)]
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, key=key)
-        change, moments = optax.adam(self.learning_rate).update(gradient, state.moments)
-        encoder = optax.apply_updates(state.encoder, change)
+        encoder, moments = adam_step(state.encoder, gradient, state.moments, self.learning_rate)
         return PCILState(encoder, moments, jnp.asarray(expert.obs)), metrics
 
     def reward(

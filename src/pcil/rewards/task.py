@@ -26,14 +26,18 @@ class TaskReward(Reward):
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> None:
         del demos, embed, key
 
-    def update(
-        self, state: None, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
-    ) -> tuple[None, Metrics]:
+    def update(self, state: None, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[None, Metrics]:
         del state, expert, agent, embed, key
         return None, {}
 
     def reward(
-        self, state: None, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: PRNGKeyArray
+        self,
+        state: None,
+        obs: Float[Array, "T obs"],
+        action: Float[Array, "T action"],
+        embed: Embed,
+        *,
+        key: PRNGKeyArray,
     ) -> Float[Array, " T"]:
         del state, action, embed, key
         return jnp.zeros(obs.shape[0], obs.dtype)

@@ -1,0 +1,38 @@
+# make train: set up everything and train PCIL on a real task. make test: set up everything and run the tests.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.ready
+
+.PHONY: setup train test test-slow check bench format clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml uv.lock
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --extra ot --inexact --quiet
+	touch $(STAMP)
+
+train: $(STAMP)
+	$(BIN)/pcil train walker_walk --preset default --seed 1 --frames 120000 --out runs/quickstart
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+bench: $(STAMP)
+	$(BIN)/pcil bench
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf .venv runs .pytest_cache .ruff_cache .hypothesis

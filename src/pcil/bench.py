@@ -1,0 +1,223 @@
+"""The speed of each part and its ratio to the floor, measured in one process on one thread (`pcil bench`).
+
+The floor of an update is the time of its matrix products alone: they are read off the update's own jaxpr, so the two always
+hold the same products of the same shapes.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+KEYS = (
+    "update_ms",
+    "floor_ms",
+    "agent_update_ms",
+    "agent_floor_ms",
+    "env_step_us",
+    "physics_us",
+    "act_us",
+    "sample_us",
+    "loop_update_share",
+    "frames_per_second",
+)
+
+
+def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
+    """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = "1"
+    from pcil import envs, presets
+    from pcil.envs.timing import measure_env
+
+    imitation, alone = (presets.make(task, method, preset) for method in ("pcil", "expert"))
+    env = envs.make(imitation.task)
+    parts = {}
+    for name, run in (("", imitation), ("agent_", alone)):
+        setup = _Setup(run, envs.spec(env))
+        parts[f"{name}update_ms"] = setup.update
+        parts[f"{name}floor_ms"] = setup.floor
+    setup = _Setup(imitation, envs.spec(env))
+    parts |= {"act_us": setup.act, "sample_us": setup.sample}
+    figures = _medians(parts, seconds / 2)
+    timing = measure_env(imitation.task)
+    figures |= {name: timing[name] for name in ("env_step_us", "physics_us")}
+    share, speed = _loop_share(imitation, seconds / 2)
+    return {name: float({**figures, "loop_update_share": share, "frames_per_second": speed}[name]) for name in KEYS}
+
+
+def table(figures: dict[str, float]) -> str:
+    """The figures for a person, with the ratios that they are measured for."""
+    f = figures
+    return "\n".join(
+        [
+            f"PCIL update      {f['update_ms']:8.2f} ms   its matrix products alone {f['floor_ms']:8.2f} ms   "
+            f"ratio {f['update_ms'] / f['floor_ms']:.2f}",
+            f"agent's update   {f['agent_update_ms']:8.2f} ms   its matrix products alone {f['agent_floor_ms']:8.2f} ms   "
+            f"ratio {f['agent_update_ms'] / f['agent_floor_ms']:.2f}",
+            f"environment step {f['env_step_us']:8.1f} us   the bare physics          {f['physics_us']:8.1f} us   "
+            f"ratio {f['env_step_us'] / f['physics_us']:.2f}",
+            f"acting           {f['act_us']:8.1f} us   a share of the environment step of {f['act_us'] / f['env_step_us']:.2f}",
+            f"sampling         {f['sample_us']:8.1f} us   a share of the update of {f['sample_us'] / f['update_ms'] / 1e3:.3f}",
+            f"the loop         {f['loop_update_share']:8.1%} of its time in the update, {f['frames_per_second']:,.0f} frames/s",
+        ]
+    )
+
+
+class _Setup:
+    """One method's update on made-up data of a task's sizes, and the other parts beside it."""
+
+    def __init__(self, run: Any, spec: Any) -> None:
+        import jax
+        import numpy as np
+
+        from pcil import learner
+        from pcil.loop import on_host
+        from pcil.replay import Replay
+        from pcil.types import Batch, Episode
+
+        rng = np.random.default_rng(0)
+        self.run, self.rng, self.count = run, rng, 0
+
+        def normal(*shape: int) -> np.ndarray:
+            return rng.standard_normal(shape, dtype=np.float32)
+
+        demos = Batch(normal(5000, spec.obs_dim), normal(5000, spec.action_dim))
+        self.expert = Batch(demos.obs[: run.reward.batch_size], demos.action[: run.reward.batch_size])
+        self.replay = Replay(50_000, spec.obs_dim, spec.action_dim)
+        for _ in range(50):
+            reward = rng.uniform(size=500)
+            self.replay.add(Episode(normal(501, spec.obs_dim), np.tanh(normal(500, spec.action_dim)), reward), reward)
+        self.window = self.replay.sample(rng, run.agent.batch_size, run.agent.n_step)
+        self.state = learner.init(run.learner, spec, demos if run.reward.needs_demos else self.expert, 0)
+        self.actor = on_host(run.agent.actor(self.state.agent))
+        self.obs = normal(spec.obs_dim)
+        step = functools.partial(learner.update, run.learner)
+        jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, np.int32(0), np.int32(0))
+        self.products = _products(list(_dot_generals(jaxpr.jaxpr)))
+
+    def update(self, times: int) -> None:
+        """`times` updates, waited for at the end."""
+        import jax
+        import numpy as np
+
+        from pcil import learner
+
+        for _ in range(times):
+            step, self.count = np.int32(self.count), self.count + 1
+            self.state, actor = learner.update(self.run.learner, self.state, self.window, self.expert, step, step)
+        jax.block_until_ready((self.state, actor))
+
+    def floor(self, times: int) -> None:
+        """The same number of times the matrix products of an update."""
+        import jax
+
+        for _ in range(times):
+            results = self.products()
+        jax.block_until_ready(results)
+
+    def act(self, times: int) -> None:
+        """Actions for one observation."""
+        for _ in range(times):
+            self.run.agent.explore(self.actor, self.obs, step=0, rng=self.rng)
+
+    def sample(self, times: int) -> None:
+        """Batches of windows."""
+        for _ in range(times):
+            self.replay.sample(self.rng, self.run.agent.batch_size, self.run.agent.n_step)
+
+
+def _dot_generals(jaxpr: Any) -> Iterator[Any]:
+    """Every matrix product of a jaxpr, those of inner ones too."""
+    from jax.extend import core
+
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation
+        for inner in core.jaxprs_in_params(equation.params):
+            yield from _dot_generals(inner)
+
+
+def _products(equations: list[Any]) -> Callable[[], Any]:
+    """A compiled call of these matrix products on made-up operands.
+
+    Left operands are distinct, so that no two products are merged; right ones are shared by shape, as weights are.
+    """
+    import jax
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    lefts = [rng.standard_normal(e.invars[0].aval.shape, dtype=np.float32) for e in equations]
+    shapes = {e.invars[1].aval.shape for e in equations}
+    rights = {shape: rng.standard_normal(shape, dtype=np.float32) for shape in shapes}
+    lefts, rights = jax.device_put((lefts, rights))
+
+    @jax.jit
+    def run(lefts: list[Any], rights: dict[Any, Any]) -> list[Any]:
+        pairs = zip(equations, lefts, strict=True)
+        return [jax.lax.dot_general(left, rights[e.invars[1].aval.shape], e.params["dimension_numbers"]) for e, left in pairs]
+
+    return lambda: run(lefts, rights)
+
+
+def _medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str, float]:
+    """Median time of one call of each part, in the unit that its name ends with; the parts take turns."""
+    units = {name: 1e3 if name.endswith("_ms") else 1e6 for name in parts}
+    times = {name: 20 if name.endswith("_ms") else 500 for name in parts}
+    blocks: dict[str, list[float]] = {name: [] for name in parts}
+    for part in parts.values():
+        part(2)
+    begin = time.perf_counter()
+    while time.perf_counter() - begin < seconds or len(blocks["update_ms"]) < 3:
+        for name, part in parts.items():
+            start = time.perf_counter()
+            part(times[name])
+            blocks[name].append((time.perf_counter() - start) / times[name] * units[name])
+    return {name: statistics.median(values) for name, values in blocks.items()}
+
+
+def _loop_share(run: Any, seconds: float) -> tuple[float, float]:
+    """Share of a real loop's time that is spent in the update, and frames a second, over whole episodes after compiling.
+
+    Each update is waited for here, which the loop itself does not do, so that its time is its own.
+    """
+    import jax
+
+    from pcil import learner, loop, runs
+
+    inside, marks = 0.0, []
+    original = learner.update
+
+    def timed(*arguments: Any) -> Any:
+        nonlocal inside
+        start = time.perf_counter()
+        result = jax.block_until_ready(original(*arguments))
+        inside += time.perf_counter() - start
+        return result
+
+    class Watch(runs.Silent):
+        """Notes the time at the end of each episode, and stops when there are enough."""
+
+        def stop(self) -> bool:
+            marks.append((time.perf_counter(), inside))
+            return len(marks) >= 6 and marks[-1][0] - marks[3][0] > seconds
+
+    learner.update = timed
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            runs.execute(run, Path(folder) / "run", Watch())
+    except loop.Stopped:
+        pass
+    finally:
+        learner.update = original
+    (start, before), (end, after) = marks[3], marks[-1]
+    frames = (len(marks) - 4) * 1000
+    return (after - before) / (end - start), frames / (end - start)

@@ -1,0 +1,326 @@
+"""The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
+
+import importlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pcil.errors import InputError
+
+if TYPE_CHECKING:
+    from pcil.config import Run
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; 0 on success, 2 on bad input, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    if words[0] == "--version":
+        print(f"pcil {importlib.import_module('pcil').__version__}")
+        return 0
+    try:
+        if words[0] not in COMMANDS:
+            raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
+        return COMMANDS[words[0]](words[1:])
+    except InputError as error:
+        print(f"pcil: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("pcil: stopped; the same command goes on from the last checkpoint.", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 141
+
+
+def _overview() -> str:
+    lines = ["usage: pcil COMMAND ...", "", "Policies from demonstrations.", "", "commands:"]
+    lines += [f"  {name:<10}{(command.__doc__ or '').splitlines()[0]}" for name, command in COMMANDS.items()]
+    return "\n".join([*lines, "", "pcil COMMAND --help tells more; pcil --version prints the version."])
+
+
+def _parse(name: str, function: Callable[..., int], words: list[str]) -> int:
+    import tyro
+
+    return tyro.cli(function, prog=f"pcil {name}", args=words)
+
+
+def _train(words: list[str]) -> int:
+    """Train a policy, or resume where a run stopped."""
+    import tyro
+
+    from pcil import envs, presets
+    from pcil.config import Run
+
+    given = _peek(words)
+    task = envs.task_name(given.get("task", "walker_walk"))
+    changes = {}
+    if "reward" in given:
+        changes["reward"] = _load_reward(given["reward"])
+        words = _take_option(words, "reward")
+    default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
+    if "task" not in given and not {"-h", "--help"} & set(words):
+        raise InputError(f"Which task? Name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
+
+    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name="")] = default) -> int:
+        """Train a policy, or resume where a run stopped.
+
+        The settings shown are those of the chosen method and preset. --reward my.module:MyReward takes a reward of your own
+        in place of the method's.
+
+        Args:
+            out: The run's folder; one that holds the same run resumes it.
+        """
+        return _run(run, out)
+
+    return _parse("train", train, words)
+
+
+def _peek(words: list[str]) -> dict[str, str]:
+    """The values of the options as they are given, before the method has decided which options there are."""
+    given, rest = {}, iter(words)
+    for word in rest:
+        if word.startswith("--") and "=" in word:
+            name, value = word[2:].split("=", 1)
+            given[name] = value
+        elif word.startswith("--"):
+            given[word[2:]] = next(rest, "")
+        elif not word.startswith("-"):
+            given["task"] = word
+    return given
+
+
+def _take_option(words: list[str], name: str) -> list[str]:
+    """`words` without `--name VALUE` and `--name=VALUE`."""
+    left, rest = [], iter(words)
+    for word in rest:
+        if word == f"--{name}":
+            next(rest, None)
+        elif not word.startswith(f"--{name}="):
+            left.append(word)
+    return left
+
+
+def _run(run: "Run", out: Path) -> int:
+    """Execute with a progress bar; end with a plain statement of how close to the expert it came, and the curve."""
+    from rich.console import Console
+
+    from pcil import envs, loop, progress, runs
+
+    demos = runs.demonstrations(run)
+    expert = demos.return_mean if demos else _shipped_return(envs.task_name(run.task))
+    with progress.Bar(Console(), expert) as bar:
+        try:
+            result = runs.execute(run, out, bar)
+        except loop.Stopped:
+            bar.say(f"Stopped; the run in {out} is saved, and the same command goes on from here.")
+            return 128 + int(bar.signal or 0)
+        if not bar.evaluations:
+            bar.say(f"The run in {out} is done.")
+        share = f", {result.final_return / expert:.0%} of the expert's {expert:.1f}" if expert else ""
+        bar.say(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
+        bar.say(f"Policy: {out / 'policy'}")
+        _draw_curve(out, expert, bar)
+    return 0
+
+
+def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
+    try:
+        from pcil.report import figures
+    except ImportError:
+        bar.say("No learning curve is drawn without matplotlib; pip install 'pcil[report]' brings it.")
+    else:
+        bar.say(f"Learning curve: {figures.run_curve(out, expert)}")
+
+
+def _shipped_return(task: str) -> float | None:
+    from pcil.demos import shipped
+
+    return {row["task"]: row["return_mean"] for row in shipped()}.get(task)
+
+
+def _load_reward(spec: str) -> Any:
+    """An instance of the reward class that `module:Class` names."""
+    from pcil.rewards import Reward
+
+    module, _, name = spec.partition(":")
+    sys.path.insert(0, "")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InputError(f"--reward {spec!r} can't be loaded ({error}); it must look like my.module:MyReward.") from error
+    if not (isinstance(kind, type) and issubclass(kind, Reward)):
+        raise InputError(f"--reward {spec!r} is no subclass of pcil.Reward.")
+    return kind()
+
+
+def _evaluate(words: list[str]) -> int:
+    """Roll out the policy of a run, without exploration."""
+
+    import tyro
+
+    def evaluate(
+        folder: Path,
+        /,
+        episodes: int = 10,
+        seed: int = 0,
+        json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    ) -> int:
+        """Roll out the policy of a run, without exploration.
+
+        Args:
+            folder: A run's folder, or one that holds policy.json and policy.safetensors.
+            episodes: How many.
+            seed: The episodes' starts follow from it.
+            json_output: Print one JSON object and nothing else.
+        """
+        from pcil import envs
+        from pcil.evaluate import evaluate as roll_out
+        from pcil.policy import load_policy
+
+        if episodes < 1:
+            raise InputError(f"--episodes is {episodes}; it must be at least 1.")
+        policy = load_policy(folder)
+        result = roll_out(policy, [envs.make(policy.task) for _ in range(episodes)], seed=seed)
+        row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
+        row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
+        if json_output:
+            print(json.dumps(row))
+        else:
+            print(f"{policy.task}: return {result.mean:.1f} +- {row['return_std']:.1f} over {episodes} episodes")
+            print("  " + "  ".join(f"{value:.1f}" for value in result.returns))
+        return 0
+
+    return _parse("evaluate", evaluate, words)
+
+
+def _demos(words: list[str]) -> int:
+    """List the demonstrations that ship."""
+
+    import tyro
+
+    def demos(json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+        """List the demonstrations that ship.
+
+        Args:
+            json_output: Print one JSON list and nothing else.
+        """
+        from pcil.demos import shipped
+
+        rows = shipped()
+        if json_output:
+            print(json.dumps(rows))
+            return 0
+        columns = [
+            "task",
+            "observation_dim",
+            "action_dim",
+            "episodes",
+            "return_mean",
+            "return_std",
+            "expert",
+            "frames",
+            "seeds_tried",
+        ]
+        _print_table(columns, rows)
+        return 0
+
+    return _parse("demos", demos, words)
+
+
+def _record(words: list[str]) -> int:
+    """Record demonstrations from a trained policy."""
+
+    def record(folder: Path, /, out: Path, episodes: int = 10, seed: int = 0, minimum_return: float | None = None) -> int:
+        """Record demonstrations from a trained policy, as a Minari dataset.
+
+        Args:
+            folder: A run's folder, or one that holds policy.json and policy.safetensors.
+            out: The dataset's folder; it must not exist.
+            episodes: How many.
+            seed: The episodes' starts follow from it.
+            minimum_return: Keep only episodes above this return.
+        """
+        from pcil import demos, envs
+        from pcil.policy import load_policy
+        from pcil.runs import provenance
+
+        policy = load_policy(folder)
+        info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed} --out {out}")
+        recorded = demos.record(
+            policy,
+            envs.make(policy.task),
+            episodes,
+            task=policy.task,
+            seed=seed,
+            minimum_return=minimum_return,
+            info=info,
+        )
+        path = recorded.save(out)
+        print(f"{episodes} episodes of {policy.task}, return {recorded.return_mean:.1f} +- {recorded.return_std:.1f}: {path}")
+        return 0
+
+    return _parse("record", record, words)
+
+
+def _bench(words: list[str]) -> int:
+    """Measure the speed of each part, and its ratio to the floor."""
+
+    import tyro
+
+    def bench(
+        task: str = "walker_walk",
+        preset: str = "default",
+        seconds: float = 20.0,
+        json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    ) -> int:
+        """Measure the speed of each part, and its ratio to the floor, on one thread.
+
+        Args:
+            task: The environment, and the sizes of its networks.
+            preset: Settings of PCIL whose update is measured.
+            seconds: About how long to measure.
+            json_output: Print one JSON object and nothing else.
+        """
+        from pcil import bench
+
+        figures = bench.measure(task, preset, seconds)
+        print(json.dumps(figures) if json_output else bench.table(figures))
+        return 0
+
+    return _parse("bench", bench, words)
+
+
+def _doctor(words: list[str]) -> int:
+    """Say what is installed, what is wrong, and what to do."""
+
+    def doctor() -> int:
+        """Say what is installed, what is wrong, and what to do; exit code 1 where training can't work."""
+        from pcil import doctor
+
+        return doctor.report()
+
+    return _parse("doctor", doctor, words)
+
+
+def _print_table(columns: list[str], rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*(f"{row[c]:.1f}" if isinstance(row[c], float) else str(row[c]) for c in columns))
+    Console().print(table)
+
+
+COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "train": _train,
+    "evaluate": _evaluate,
+    "demos": _demos,
+    "record": _record,
+    "bench": _bench,
+    "doctor": _doctor,
+}

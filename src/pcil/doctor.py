@@ -1,0 +1,116 @@
+"""What is installed, what is wrong, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+Check = tuple[str, Callable[[], str], str, bool]
+"""What is checked, how (returns a finding, raises where it fails), what to do then, and whether training needs it."""
+
+
+def report() -> int:
+    """Print one row a check; 1 where something that training needs is missing."""
+    table = Table("", "part", "found", "what to do")
+    broken = False
+    for name, look, remedy, needed in CHECKS:
+        try:
+            found, advice, mark = look(), "", "[green]ok[/]"
+        except Exception as error:  # whatever a broken install raises is the finding
+            found, advice = f"{type(error).__name__}: {error}".splitlines()[0][:90], remedy
+            mark = "[red]wrong[/]" if needed else "[yellow]absent[/]"
+            broken |= needed
+        table.add_row(mark, name, found, advice)
+    Console().print(table)
+    return int(broken)
+
+
+def _python() -> str:
+    version = platform.python_version_tuple()
+    if (int(version[0]), int(version[1])) < (3, 11):
+        raise RuntimeError(f"Python {platform.python_version()}")
+    return f"{platform.python_version()} on {platform.system()}, {os.cpu_count()} cores"
+
+
+def _versions(*names: str) -> Callable[[], str]:
+    return lambda: ", ".join(f"{name} {metadata.version(name)}" for name in names)
+
+
+def _mujoco() -> str:
+    version = metadata.version("mujoco")
+    if int(version.split(".")[0]) >= 4:
+        raise RuntimeError(f"mujoco {version} does not work with dm-control {metadata.version('dm-control')}")
+    return f"mujoco {version}, dm-control {metadata.version('dm-control')}"
+
+
+def _devices() -> str:
+    import jax
+
+    return f"jax {jax.__version__}: " + ", ".join(str(device) for device in jax.devices())
+
+
+def _environment() -> str:
+    from pcil import envs
+
+    env = envs.make("pendulum_swingup")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    return "pendulum_swingup steps"
+
+
+def _demonstrations() -> str:
+    from pcil.demos import shipped
+
+    rows = shipped()
+    if not rows:
+        raise RuntimeError("none in the package")
+    return f"{len(rows)} tasks: " + ", ".join(row["task"] for row in rows)
+
+
+def _cache() -> str:
+    from pcil import compilation
+
+    folder = compilation.cache_folder()
+    probe = Path(folder) / ".probe"
+    probe.parent.mkdir(parents=True, exist_ok=True)
+    probe.touch()
+    probe.unlink()
+    return str(folder)
+
+
+def _rendering() -> str:
+    from pcil import envs
+
+    env = envs.make("pendulum_swingup", render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    return f"frames of {getattr(frame, 'shape', None)} with MUJOCO_GL={os.environ.get('MUJOCO_GL', 'default')}"
+
+
+def _importable(module: str, package: str) -> Callable[[], str]:
+    def look() -> str:
+        importlib.import_module(module)
+        return f"{package} {metadata.version(package)}"
+
+    return look
+
+
+CHECKS: tuple[Check, ...] = (
+    ("Python", _python, "install Python 3.11 or newer", True),
+    ("networks", _versions("equinox", "optax", "numpy"), "pip install --force-reinstall pcil", True),
+    ("physics", _mujoco, "pip install 'mujoco<4'", True),
+    ("device", _devices, "pip install --force-reinstall jax; for a GPU: pip install 'pcil[cuda]'", True),
+    ("environment", _environment, "pip install --force-reinstall dm-control 'mujoco<4'", True),
+    ("demonstrations", _demonstrations, "pip install --force-reinstall pcil, or give --demos", False),
+    ("compilation cache", _cache, "set JAX_COMPILATION_CACHE_DIR to a folder that can be written", False),
+    ("figures", _importable("matplotlib", "matplotlib"), "pip install 'pcil[report]'", False),
+    ("optimal transport", _importable("ot", "pot"), "pip install 'pcil[ot]'", False),
+    ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
+)

@@ -1,0 +1,25 @@
+"""Every test runs with shapes checked at run time, no silent broadcasting of ranks or mixing of dtypes, and no warning."""
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "disabled")
+
+from jaxtyping import install_import_hook
+
+install_import_hook("pcil", "beartype.beartype")
+
+import jax
+import pytest
+
+from pcil.compilation import use_cache
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+use_cache()
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: pytest.TempPathFactory) -> None:
+    """No test leaves files in the project, and none reads the user's own datasets."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))

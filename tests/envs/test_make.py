@@ -1,0 +1,161 @@
+"""Every way to name an environment, and what is said about the names and spaces that do not work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from pcil import envs
+from pcil.envs import TASKS, make, register, spec, task_name
+from pcil.envs.timing import measure_env
+from pcil.types import InputError, Spec
+
+SPECS = {
+    "finger_spin": Spec(9, 2, 2),
+    "hopper_stand": Spec(15, 4, 2),
+    "pendulum_swingup": Spec(3, 1, 2),
+    "walker_stand": Spec(24, 6, 2),
+    "walker_walk": Spec(24, 6, 2),
+    "acrobot_swingup": Spec(6, 1, 2),
+    "cheetah_run": Spec(17, 6, 2),
+    "hopper_hop": Spec(15, 4, 2),
+    "quadruped_run": Spec(78, 12, 2),
+    "walker_run": Spec(24, 6, 2),
+}
+
+
+class DictEnv(gymnasium.Env):
+    """Two boxes in a dictionary, a matrix among them, and actions with bounds of their own."""
+
+    def __init__(self, action_space: spaces.Space | None = None, observation_space: spaces.Space | None = None) -> None:
+        low, high = np.array([0.0, -2.0]), np.array([1.0, 4.0])
+        self.action_space = action_space or spaces.Box(low, high, dtype=np.float64)
+        boxes = {"b": spaces.Box(-9.0, 9.0, (2, 2), np.float64), "a": spaces.Box(-9.0, 9.0, (1,), np.float32)}
+        self.observation_space = observation_space or spaces.Dict(boxes)
+        self.last_action = None
+
+    def _obs(self) -> dict[str, np.ndarray]:
+        return {"b": np.array([[1.0, 2.0], [3.0, 4.0]]), "a": np.array([5.0], np.float32)}
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        return self._obs(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict]:
+        self.last_action = action
+        return self._obs(), 0.0, False, False, {}
+
+
+@pytest.fixture
+def register_env() -> Iterator[Any]:
+    """Registers environments as `pcil_test/...` for the length of a test."""
+    yield lambda name, entry_point, **kwargs: gymnasium.register(f"pcil_test/{name}", entry_point, kwargs=kwargs)
+    for env_id in [env_id for env_id in gymnasium.registry if env_id.startswith("pcil_test/")]:
+        del gymnasium.registry[env_id]
+
+
+def test_public_names() -> None:
+    assert set(envs.__all__) == {"TASKS", "make", "register", "spec", "task_name"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_ten_have_their_sizes_and_no_wrapper(task: str) -> None:
+    env = make(task)
+    assert spec(env) == SPECS[task]
+    assert env is env.unwrapped
+    assert env.spec.id == f"dmc/{task}-v0"
+    assert env.observation_space.dtype == env.action_space.dtype == np.float32
+    assert np.all(env.action_space.low == -1.0) and np.all(env.action_space.high == 1.0)
+
+
+def test_a_task_has_one_name() -> None:
+    register()
+    assert isinstance(gymnasium.make("dmc/walker_walk-v0"), type(make("walker_walk")))
+    assert make("dmc/walker_walk-v0").spec == make("walker_walk").spec
+    assert task_name("dmc/walker_walk-v0") == task_name("walker_walk") == "walker_walk"
+    assert task_name("Pendulum-v1") == "Pendulum-v1" and task_name("toy/probe_1-v0") == "toy/probe_1-v0"
+
+
+@pytest.mark.parametrize("task", ["ball_in_cup_catch", "dmc/humanoid_CMU_run-v0"])
+def test_other_tasks_of_the_suite_register_on_demand(task: str) -> None:
+    gymnasium.registry.pop(f"dmc/{task_name(task)}-v0", None)
+    assert make(task).spec.id == f"dmc/{task_name(task)}-v0"
+
+
+def test_a_gymnasium_env_is_flattened_and_rescaled(register_env: Any) -> None:
+    register_env("Dict-v0", DictEnv)
+    env = make("pcil_test/Dict-v0")
+    assert spec(env) == Spec(5, 2, 1)
+    assert env.observation_space.dtype == env.action_space.dtype == np.float32
+    obs, _ = env.reset(seed=0)
+    assert obs.dtype == np.float32
+    np.testing.assert_array_equal(obs, [5.0, 1.0, 2.0, 3.0, 4.0])  # Gymnasium sorts the names
+    for action, received in ((-1.0, [0.0, -2.0]), (0.0, [0.5, 1.0]), (1.0, [1.0, 4.0])):
+        env.step(np.full(2, action, np.float32))
+        np.testing.assert_allclose(env.unwrapped.last_action, received, atol=1e-15)
+        assert env.unwrapped.last_action.dtype == np.float64
+
+
+def test_a_real_gymnasium_env_works() -> None:
+    env = make("Pendulum-v1")
+    assert spec(env) == Spec(3, 1, 1)
+    env.reset(seed=0)
+    obs, _, _, truncated, _ = [env.step(env.action_space.sample()) for _ in range(200)][-1]
+    assert obs.dtype == np.float32 and truncated  # its own time limit stays
+
+
+@pytest.mark.parametrize(
+    ("spaces_given", "message"),
+    [
+        ({"action_space": spaces.Discrete(2)}, r"actions of 'pcil_test/Bad-v0' must be a flat Box.*Discrete\(2\)"),
+        ({"action_space": spaces.Box(-1.0, 1.0, (2, 2))}, "must be a flat Box"),
+        ({"action_space": spaces.Box(-np.inf, np.inf, (2,))}, "must have finite bounds"),
+        ({"observation_space": spaces.Discrete(2)}, "observations of 'pcil_test/Bad-v0' must be a Box or a Dict"),
+        ({"observation_space": spaces.Dict({"a": spaces.Discrete(2)})}, "must be a Box or a Dict of Boxes"),
+    ],
+)
+def test_other_spaces_are_refused(register_env: Any, spaces_given: dict[str, spaces.Space], message: str) -> None:
+    register_env("Bad-v0", DictEnv, **spaces_given)
+    with pytest.raises(InputError, match=message):
+        make("pcil_test/Bad-v0")
+
+
+@pytest.mark.parametrize("name", ["nonsense", "walker walk!", "dmc/walker_fly-v0", "pcil_test/None-v0", ""])
+def test_unknown_names_list_what_there_is(name: str) -> None:
+    with pytest.raises(InputError) as error:
+        make(name)
+    assert all(task in str(error.value) for task in TASKS) and "any Gymnasium id" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("walker_wlak", "walker_walk"),
+        ("ball_in_cup_cath", "ball_in_cup_catch"),
+        ("Pendulm-v1", "Pendulum-v1"),
+        ("toy/point_mas-v0", "toy/point_mass-v0"),
+    ],
+)
+def test_near_misses_are_recognised(name: str, meant: str) -> None:
+    with pytest.raises(InputError, match=f"did you mean '{meant}'"):
+        make(name)
+
+
+def test_a_missing_package_is_named(register_env: Any) -> None:
+    register_env("Missing-v0", "package_that_is_not:Env")
+    for name in ("pcil_test/Missing-v0", "package_that_is_not:Env-v0"):
+        with pytest.raises(InputError, match="not installed: No module named 'package_that_is_not'"):
+            make(name)
+
+
+def test_timing_has_bare_physics_only_for_deepmind_control() -> None:
+    measured = measure_env("pendulum_swingup", episodes=1)
+    assert measured.keys() == {"env_step_us", "physics_us", "ratio"}
+    assert measured["env_step_us"] > measured["physics_us"] > 0.0
+    with pytest.raises(InputError, match="bare physics"):
+        measure_env("toy/point_mass-v0")

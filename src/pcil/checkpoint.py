@@ -17,11 +17,14 @@ Arrays = dict[str, np.ndarray]
 
 
 def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) -> None:
-    """Write one checkpoint as `folder/<frames>`: whole, by a rename, or not at all. Older ones than the last two go."""
+    """Write one checkpoint as `folder/<frames>`: whole, by a rename, or not at all.
+
+    Older ones than the last two go, and so do those after `frames`: `restore` passed over them, for they were damaged.
+    """
     import orbax.checkpoint as ocp
 
     final, partial = folder / str(frames), folder / f"partial-{frames}"
-    for path in (final, partial):
+    for path in (final, *folder.glob("partial-*")):
         shutil.rmtree(path, ignore_errors=True)
     partial.mkdir(parents=True)
     ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
@@ -29,8 +32,10 @@ def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) ->
     text = json.dumps(meta)
     (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
     partial.rename(final)
-    for old in _newest_first(folder)[KEEP:]:
-        shutil.rmtree(old)
+    others = _newest_first(folder)
+    kept = others[others.index(final) :][:KEEP]
+    for path in set(others) - set(kept):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def restore(folder: Path) -> tuple[Arrays | None, dict[str, Any], list[str]]:
@@ -57,9 +62,12 @@ def unflatten(name: str, like: Any, arrays: Arrays) -> Any:
     array_part, rest = eqx.partition(like, eqx.is_array)
 
     def take(path: Any, leaf: Any) -> Any:
-        array = arrays[f"{name}{jax.tree_util.keystr(path)}"]
+        full = f"{name}{jax.tree_util.keystr(path)}"
+        array, expected = arrays.get(full), f"{leaf.dtype}{list(leaf.shape)}"
+        if array is None:
+            raise ValueError(f"{full} is missing, expected {expected}")
         if array.shape != leaf.shape or array.dtype != leaf.dtype:
-            raise ValueError(f"{name}{jax.tree_util.keystr(path)} has shape {array.shape}, expected {leaf.shape}")
+            raise ValueError(f"{full} is {array.dtype}{list(array.shape)}, expected {expected}")
         return jax.numpy.asarray(array)
 
     return eqx.combine(jax.tree_util.tree_map_with_path(take, array_part), rest)

@@ -293,8 +293,7 @@ def _episode(raw: dict[str, Any], seed: int | None, observation_space: dict, act
     obs, stored = _flat(raw["observations"], observation_space), _flat(raw["actions"], action_space)
     action = (stored - (high + low) / 2) / ((high - low) / 2)
     reward, *flags = (np.asarray(raw[key]) for key in ("rewards", "terminations", "truncations"))
-    reward_type = np.float32 if reward.dtype == np.float32 else np.float64
-    reward = _flat(reward, {"type": "Box", "shape": []})[:, 0].astype(reward_type)
+    reward = _flat(reward, {"type": "Box", "shape": []})[:, 0].astype("f4" if reward.dtype == np.float32 else "f8")
     steps, lengths = len(action), (len(obs), len(reward), *map(len, flags))
     if steps == 0 or lengths != (steps + 1, steps, steps, steps):
         given = "{} observations, {} rewards, {} terminations and {} truncations".format(*lengths)

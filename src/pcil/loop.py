@@ -72,30 +72,29 @@ def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> tupl
     spec = envs.spec(env)
     rollout = [envs.make(run.task) for _ in range(run.evaluate_episodes)]
     state, positions = _resume(run, folder, _start(run, spec, demos), reporter)
-    log = MetricWriter(folder, positions, state.counters.frames)
     clock = _Clock(state.counters.seconds)
     saved = clock.total()
 
-    while state.counters.frames < run.frames:
-        if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
-            _evaluate(run, folder, state, rollout, log, clock, reporter)
+    with MetricWriter(folder, positions, state.counters.frames) as log:
+        while state.counters.frames < run.frames:
+            if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
+                _evaluate(run, folder, state, rollout, log, clock, reporter)
 
-        episode = _play(run, env, spec, state, demos)
-        learned, correlation = _label(run, state, episode)
-        state.replay.add(episode, learned if run.label == "stored" else episode.reward)
-        _log_episode(state, episode, learned, correlation, log, clock)
-        reporter.episode(run, state.counters.frames, episode.total_reward)
+            episode = _play(run, env, spec, state, demos)
+            learned, correlation = _label(run, state, episode)
+            state.replay.add(episode, learned if run.label == "stored" else episode.reward)
+            _log_episode(state, episode, learned, correlation, log, clock)
+            reporter.episode(run, state.counters.frames, episode.total_reward)
 
-        stop = reporter.stop()
-        if stop or clock.total() - saved >= run.checkpoint_seconds:
-            _save(folder, state, log, clock, replay=True)
-            saved = clock.total()
-        if stop:
-            raise Stopped
+            stop = reporter.stop()
+            if stop or clock.total() - saved >= run.checkpoint_seconds:
+                _save(folder, state, log, clock, replay=True)
+                saved = clock.total()
+            if stop:
+                raise Stopped
 
-    result = _evaluate(run, folder, state, rollout, log, clock, reporter)
-    _save(folder, state, log, clock, replay=False)
-    log.close()
+        result = _evaluate(run, folder, state, rollout, log, clock, reporter)
+        _save(folder, state, log, clock, replay=False)
     return state, result
 
 

@@ -50,6 +50,12 @@ class MetricWriter:
             if isinstance(value, float) and np.isfinite(value):
                 self._board.add_scalar(name if "/" in name else f"episode/{name}", value, frames)
 
+    def __enter__(self) -> MetricWriter:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Flush everything."""
         self._board.close()

@@ -72,7 +72,7 @@ def load_policy(path: str | Path) -> Policy:
         header = json.loads((folder / "policy.json").read_text())
         arrays = load_file(folder / "policy.safetensors")
         actor = _build(header, arrays)
-    except (ValueError, KeyError, TypeError, AttributeError, SafetensorError, OSError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, SafetensorError, OSError) as error:
         raise InputError(
             f"The policy in {folder} is damaged ({type(error).__name__}: {error}); train or copy it again."
         ) from error
@@ -93,8 +93,10 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     trunk = Trunk(*(arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset")))
     weights = tuple(arrays[f"head.weights.{i}"] for i in layers)
     biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
-    if not header["task"] or len(arrays) != 4 + 2 * len(layers):
+    if not layers or len(arrays) != 4 + 2 * len(layers):
         raise ValueError("names and arrays do not fit")
+    if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
+        raise ValueError("its task is no name or its info no table")
     width = trunk.weight.shape[1]
     if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
         raise ValueError("the trunk's shapes do not fit")

@@ -1,7 +1,7 @@
 """A ring of raw steps in NumPy that returns n-step windows. It knows nothing about learning.
 
-An episode of `T` steps takes `T + 1` rows: its last row holds the final observation and starts no window. Rows wrap around the
-end of the ring; the oldest episodes leave, whole, when their rows are needed.
+An episode of `T` steps takes `T + 1` rows: its last row holds the final observation, with action and reward 0, and starts no
+window. Rows wrap around the end of the ring; the oldest episodes leave, whole, when their rows are needed.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Replay:
             self._segments.popleft()
         index = (self._next + np.arange(rows)) % self.capacity
         self._obs[index] = episode.obs
-        self._action[index[:-1]] = episode.action
-        self._reward[index[:-1]] = reward
+        self._action[index[:-1]], self._action[index[-1]] = episode.action, 0
+        self._reward[index[:-1]], self._reward[index[-1]] = reward, 0
         self._segments.append(Segment(self._next, len(episode), episode.terminated))
         self._next = (self._next + rows) % self.capacity
         self._index = None
@@ -79,7 +79,7 @@ class Replay:
         """`batch` windows of `n` steps, uniform over all valid starts, with replacement.
 
         A window never reaches past a time limit. One that reaches past a termination has discount 0 from that step on, its
-        rewards behind it are 0, and its observations repeat the final one.
+        actions and rewards behind it are 0, and its observations repeat the final one.
         """
         table, cumulative = self._starts(n)
         total = self.num_windows(n)
@@ -95,7 +95,7 @@ class Replay:
         return Window(
             self._obs[row],
             self._action[row[:, :-1]],
-            np.where(inside, self._reward[row[:, :-1]], np.float32(0)),
+            self._reward[row[:, :-1]],
             alive.astype(np.float32),
         )
 

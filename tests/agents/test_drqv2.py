@@ -1,0 +1,130 @@
+"""The agent: its equations by hand, and five probe environments that each catch one class of bug."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from pcil import envs, loop, runs
+from pcil.agents import DrQV2
+from pcil.envs.toy import PointMass
+from pcil.types import Batch, Spec, Window
+from small import narrow, random_batch, small_run
+
+SPEC = Spec(3, 2, 1)
+AGENT = narrow(DrQV2())
+
+
+def make_window(discount: float = 1.0, seed: int = 0) -> Window:
+    rng = np.random.default_rng(seed)
+    flat = random_batch(32 * 4, 3, 2, seed)
+    reward = rng.standard_normal((32, 3), dtype=np.float32)
+    obs, action = flat.obs.reshape(32, 4, 3), flat.action.reshape(32, 4, 2)[:, :3]
+    return Window(obs, action, reward, np.full((32, 3), discount, np.float32))
+
+
+def test_target_is_the_discounted_rewards_and_the_smaller_slow_value() -> None:
+    """Naive second computation, without noise: r0 + g r1 + g^2 r2 + g^3 min(Q1', Q2')(s3, mu(s3))."""
+    state, window = AGENT.init(SPEC, key=jax.random.key(0)), make_window()
+    got = AGENT.target(state, window, jnp.zeros((32, 2)))
+    for row in range(32):
+        last = window.obs[row, 3]
+        values = state.critic_target(last, state.actor(last))
+        rewards = sum(AGENT.gamma**k * float(window.reward[row, k]) for k in range(3))
+        assert got[row] == pytest.approx(rewards + AGENT.gamma**3 * float(min(values)), abs=1e-5)
+
+
+def test_nothing_is_bootstrapped_behind_a_termination() -> None:
+    state, window = AGENT.init(SPEC, key=jax.random.key(0)), make_window(discount=0.0)
+    got = AGENT.target(state, window, jnp.zeros((32, 2)))
+    assert np.allclose(got, window.reward[:, 0])
+
+
+def test_slow_critic_moves_by_tau_and_the_trunk_with_it() -> None:
+    state = AGENT.init(SPEC, key=jax.random.key(0))
+    after, _ = AGENT.update(state, make_window(), step=jnp.int32(0), key=jax.random.key(1))
+    for slow, fast, before in zip(*map(jax.tree.leaves, (after.critic_target, after.critic, state.critic)), strict=True):
+        assert np.allclose(slow, 0.99 * before + 0.01 * fast, atol=1e-7)
+    assert not np.array_equal(after.critic_target.trunk.weight, state.critic.trunk.weight)
+
+
+def test_actor_update_leaves_the_critic_alone_and_raises_its_value() -> None:
+    """The critic's gradient comes from its own loss only; a small step of the actor's raises min(Q1, Q2)."""
+    state, window = AGENT.init(SPEC, key=jax.random.key(0)), make_window()
+    obs, noise = jnp.asarray(window.obs[:, 0]), jnp.zeros((32, 2))
+    loss, gradient = jax.value_and_grad(AGENT.actor_loss)(state.actor, state.critic, obs, noise)
+    moved = jax.tree.map(lambda weight, slope: weight - 1e-2 * slope, state.actor, gradient)
+    assert AGENT.actor_loss(moved, state.critic, obs, noise) < loss
+    values = state.critic(obs, state.actor(obs))
+    assert loss == pytest.approx(-float(jnp.mean(jnp.minimum(*values))), abs=1e-6)
+
+
+def test_losses_against_finite_differences() -> None:
+    with jax.enable_x64(True):
+        double = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)  # noqa: E731
+        state, window = double(AGENT.init(SPEC, key=jax.random.key(0))), double(make_window())
+        obs, action = window.obs[:, 0], window.action[:, 0]
+        target = jnp.linspace(-1.0, 1.0, 32)
+        check_grads(lambda c: AGENT.critic_loss(c, obs, action, target)[0], (state.critic,), order=1, modes=["rev"])
+        noise = jnp.zeros((32, 2))
+        check_grads(lambda a: AGENT.actor_loss(a, state.critic, obs, noise), (state.actor,), order=1, modes=["rev"])
+
+
+def test_update_noise_is_clipped_and_acting_noise_is_not() -> None:
+    wild = dataclasses.replace(AGENT, noise_clip=0.0)
+    state, window = wild.init(SPEC, key=jax.random.key(0)), make_window()
+    one, _ = wild.update(state, window, step=jnp.int32(0), key=jax.random.key(1))
+    two, _ = wild.update(state, window, step=jnp.int32(0), key=jax.random.key(2))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
+    host, rng = loop.on_host(state.actor), np.random.default_rng(0)
+    actions = [wild.explore(host, window.obs[0, 0], step=0, rng=rng) for _ in range(200)]
+    assert np.std(actions) > 0.4 and np.abs(actions).max() <= 1
+
+
+def trained_on(task: str, folder: Path, frames: int = 1200) -> loop.State:
+    agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05)
+    run = small_run("expert", task, frames=frames, random_frames=frames, evaluate_every=frames, agent=agent, update_every=1)
+    folder.mkdir()
+    empty = Batch(np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
+    state, _ = loop.train_loop(run, folder, empty, runs.Silent())
+    return state
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4, 5])
+def test_probe_environments(number: int, tmp_path: Path) -> None:
+    """Each probe's known values are learned, and the known best actions where it has any."""
+    state = trained_on(f"toy/probe_{number}-v0", tmp_path / "run")
+    probe = envs.make(f"toy/probe_{number}-v0").unwrapped
+    starts = {1: (0.0,), 2: (-1.0, 1.0), 3: (0.0, 1.0), 4: (0.0,), 5: (-1.0, 1.0)}[number]
+    for start in starts:
+        obs = jnp.array([[start]])
+        action = state.learner.agent.actor(obs)
+        values = state.learner.agent.critic(obs, action)
+        assert np.allclose(values, probe.value(start, 0.99), atol=0.1), start
+        if number >= 4:
+            assert float(action[0, 0]) == pytest.approx(probe.optimal_action(start), abs=0.15)
+
+
+@pytest.mark.slow
+def test_the_task_reward_agent_solves_the_point_mass(tmp_path: Path) -> None:
+    """Within 5% of the optimal policy's return from the same starts."""
+    agent = narrow(DrQV2(), hidden=64, learning_rate=1e-3, batch_size=64)
+    run = small_run("expert", frames=6000, evaluate_every=6000, evaluate_episodes=10, agent=agent)
+    result = runs.execute(run, tmp_path / "run", runs.Silent())
+    best = np.mean([optimal_return(envs.make(run.task), seed) for seed in range(20)])
+    assert result.final_return > 0.95 * best
+
+
+def optimal_return(env: gymnasium.Env, seed: int) -> float:
+    obs, total, over = env.reset(seed=seed)[0], 0.0, False
+    while not over:
+        obs, reward, _, over, _ = env.step(PointMass.optimal_action(obs).astype(np.float32))
+        total += float(reward)
+    return total

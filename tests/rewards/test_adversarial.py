@@ -1,0 +1,53 @@
+"""DAC's discriminator and reward by hand and by a naive second computation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pcil.networks import MLP
+from pcil.rewards.adversarial import DAC, DiscriminatorState
+from small import narrow, random_batch
+
+SETTINGS = narrow(DAC())
+
+
+def test_reward_is_the_logit_even_where_the_sigmoid_saturates() -> None:
+    """`log D - log(1 - D)` of a logit of 200 is 200; by logarithms in float32 it would be infinite."""
+    discriminator = MLP((jnp.ones((1, 1)), jnp.ones((1, 1))), (jnp.zeros(1), jnp.zeros(1)))
+    state = DiscriminatorState(discriminator, None)
+    obs = jnp.array([[0.0], [3.0], [200.0]])
+    assert np.allclose(SETTINGS.reward(state, obs, obs, lambda x: x, key=jax.random.key(0)), [0.0, 3.0, 200.0])
+
+
+def test_loss_equals_a_naive_one() -> None:
+    expert, agent = (jnp.asarray(random_batch(32, 5, 1, seed).obs) for seed in (1, 2))
+    discriminator, key = MLP.init((5, 16, 16, 1), key=jax.random.key(0)), jax.random.key(3)
+    total, metrics = SETTINGS.loss(discriminator, expert, agent, key=key)
+    d_expert, d_agent = (1 / (1 + np.exp(-np.asarray(discriminator(x)[:, 0], np.float64))) for x in (expert, agent))
+    entropy = -np.mean(np.log(d_expert)) - np.mean(np.log(1 - d_agent))
+    mixed = jax.random.uniform(key, (32, 1)) * (expert - agent) + agent
+    slopes = jax.vmap(jax.grad(lambda x: discriminator(x)[0]))(mixed)
+    penalty = np.mean((np.linalg.norm(slopes, axis=-1) - 1) ** 2)
+    assert float(metrics["entropy_loss"]) == pytest.approx(entropy, rel=1e-4)
+    assert float(total) == pytest.approx(entropy + 10 * penalty, rel=1e-3)
+
+
+def test_penalty_keeps_the_slope_near_one() -> None:
+    """Without it the logits of separable data grow without bound."""
+    expert, agent = random_batch(32, 5, 1, 1), random_batch(32, 5, 1, 2)
+    expert = expert._replace(obs=expert.obs + 3)
+    gaps = []
+    for penalty in (0.0, 10.0):
+        settings = dataclasses.replace(SETTINGS, penalty=penalty, learning_rate=1e-2)
+        state = settings.init(expert, lambda x: x, key=jax.random.key(0))
+        update = jax.jit(lambda s, k, settings=settings: settings.update(s, expert, agent, lambda x: x, key=k))
+        for i in range(150):
+            state, metrics = update(state, jax.random.key(i))
+        gaps.append(float(metrics["expert_logit"] - metrics["agent_logit"]))
+    distance = float(np.linalg.norm(expert.obs.mean(0) - agent.obs.mean(0)))
+    assert gaps[1] < 2 * distance < gaps[0]

@@ -1,0 +1,129 @@
+"""What every reward must do; one that is listed in `REWARDS` is tested by being listed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pcil import checkpoint
+from pcil.rewards import REWARDS, Reward, label
+from pcil.types import Batch
+from small import narrow, random_batch
+
+FEATURES = 5
+
+
+def embed(obs: Any) -> Any:
+    """A fixed stand-in for the agent's trunk."""
+    mix = np.random.default_rng(3).standard_normal((obs.shape[-1], FEATURES), dtype=np.float32)
+    return jnp.tanh(jnp.asarray(obs) @ mix)
+
+
+EXPERT = Batch(random_batch(200, 4, 2, seed=1).obs * 0.3 + 1.0, random_batch(200, 4, 2, seed=1).action)
+AGENT = Batch(random_batch(200, 4, 2, seed=2).obs * 0.3 - 1.0, random_batch(200, 4, 2, seed=2).action)
+
+
+def rows(batch: Batch, start: int, size: int) -> Batch:
+    return Batch(batch.obs[start : start + size], batch.action[start : start + size])
+
+
+@pytest.fixture(params=list(REWARDS), scope="module")
+def settings(request: pytest.FixtureRequest) -> Reward:
+    return narrow(REWARDS[request.param](), learning_rate=1e-2)
+
+
+@pytest.fixture(scope="module")
+def trained(settings: Reward) -> Any:
+    """The state after 60 updates on an expert and an agent that live apart."""
+    update = jax.jit(lambda state, expert, agent, key: settings.update(state, expert, agent, embed, key=key)[0])
+    state = settings.init(EXPERT, embed, key=jax.random.key(0))
+    for i in range(60):
+        start = (i * 32) % 160
+        size = settings.batch_size
+        state = update(state, rows(EXPERT, start, size), rows(AGENT, start, size), jax.random.key(i))
+    return state
+
+
+def rewards_of(settings: Reward, state: Any, batch: Batch) -> np.ndarray:
+    return np.asarray(settings.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), embed, key=jax.random.key(9)))
+
+
+def test_shape_dtype_and_finite(settings: Reward, trained: Any) -> None:
+    got = rewards_of(settings, trained, rows(AGENT, 0, 17))
+    assert got.shape == (17,) and got.dtype == np.float32 and np.isfinite(got).all()
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-20, 1e6])
+def test_finite_under_extreme_inputs(settings: Reward, scale: float) -> None:
+    size = settings.batch_size
+    expert, agent = (Batch(rows(b, 0, size).obs * np.float32(scale), rows(b, 0, size).action) for b in (EXPERT, AGENT))
+    state = settings.init(Batch(EXPERT.obs * np.float32(scale), EXPERT.action), embed, key=jax.random.key(0))
+    update = jax.jit(lambda s, e, a: settings.update(s, e, a, embed, key=jax.random.key(1)))
+    state, metrics = update(state, expert, agent)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))
+    assert np.isfinite(rewards_of(settings, state, Batch(AGENT.obs * np.float32(scale), AGENT.action))).all()
+
+
+def test_jit_equals_no_jit(settings: Reward, trained: Any) -> None:
+    obs, action, key = jnp.asarray(AGENT.obs), jnp.asarray(AGENT.action), jax.random.key(9)
+    compiled = jax.jit(lambda state, o, a: settings.reward(state, o, a, embed, key=key))(trained, obs, action)
+    assert np.allclose(compiled, rewards_of(settings, trained, AGENT), atol=1e-5)
+
+
+def test_deterministic(settings: Reward, trained: Any) -> None:
+    assert np.array_equal(rewards_of(settings, trained, AGENT), rewards_of(settings, trained, AGENT))
+    size = settings.batch_size
+    one, two = (
+        settings.update(trained, rows(EXPERT, 0, size), rows(AGENT, 0, size), embed, key=jax.random.key(5))[0] for _ in "ab"
+    )
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
+
+
+def test_inputs_unchanged(settings: Reward, trained: Any) -> None:
+    expert, agent = rows(EXPERT, 0, settings.batch_size), rows(AGENT, 0, settings.batch_size)
+    before = [array.copy() for array in (*expert, *agent)]
+    settings.update(trained, expert, agent, embed, key=jax.random.key(5))
+    rewards_of(settings, trained, AGENT)
+    assert all(np.array_equal(a, b) for a, b in zip(before, (*expert, *agent), strict=True))
+
+
+def test_state_survives_a_checkpoint(settings: Reward, trained: Any) -> None:
+    arrays = checkpoint.flatten("reward", trained)
+    fresh = settings.init(EXPERT, embed, key=jax.random.key(77))
+    restored = checkpoint.unflatten("reward", fresh, arrays)
+    assert np.array_equal(rewards_of(settings, restored, AGENT), rewards_of(settings, trained, AGENT))
+
+
+def test_expert_outranks_the_agent_after_a_few_updates(settings: Reward, trained: Any) -> None:
+    if not settings.needs_demos:
+        assert not rewards_of(settings, trained, EXPERT).any(), "a reward without demonstrations learns nothing"
+        return
+    assert np.median(rewards_of(settings, trained, EXPERT)) > np.max(rewards_of(settings, trained, AGENT))
+
+
+def test_order_matters_only_for_episode_scope(settings: Reward, trained: Any) -> None:
+    """A step's reward does not depend on its neighbours, up to which random expert row it is compared with."""
+    if settings.scope == "episode":
+        order = np.random.default_rng(0).permutation(200)
+        shuffled = rewards_of(settings, trained, Batch(AGENT.obs[order], AGENT.action[order]))
+        assert not np.allclose(shuffled, rewards_of(settings, trained, AGENT)[order])
+        return
+    period = 2 * max(settings.batch_size, 1)
+    swapped = np.roll(np.arange(200)[: 3 * period], period)
+    moved = Batch(AGENT.obs[swapped], AGENT.action[swapped])
+    assert np.allclose(rewards_of(settings, trained, moved), rewards_of(settings, trained, AGENT)[swapped], atol=1e-5)
+
+
+def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) -> None:
+    """One equation for all: learned + weight x true, in the shape of the true reward, read from the right state."""
+    rng = np.random.default_rng(0)
+    obs, action = rng.standard_normal((3, 5, 4), dtype=np.float32), rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32)
+    true = rng.standard_normal((3, 4), dtype=np.float32)
+    got = label(settings, trained, jnp.asarray(obs), jnp.asarray(action), jnp.asarray(true), embed, key=jax.random.key(9))
+    seen = obs[:, 1:] if settings.reads == "next_obs" else obs[:, :-1]
+    learned = rewards_of(settings, trained, Batch(seen.reshape(12, 4), action.reshape(12, 2))).reshape(3, 4)
+    assert np.allclose(got, learned + settings.task_weight * true, atol=1e-5)

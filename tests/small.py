@@ -1,0 +1,61 @@
+"""Settings small enough for tests: one compilation of narrow networks is shared by every test that uses them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pcil import demos, envs, presets
+from pcil.config import Run
+from pcil.envs.toy import PointMass
+from pcil.noise import LinearSchedule
+from pcil.types import Batch
+
+POINT_MASS = "toy/point_mass-v0"
+
+
+def narrow(settings: Any, **changes: Any) -> Any:
+    """An agent's or a reward's settings with hidden width 16 and batches of 32, where it has them."""
+    small = {"hidden": 16, "batch_size": 32, "feature_dim": 8, "noise": LinearSchedule(1.0, 0.1, 1000)} | changes
+    names = {field.name for field in dataclasses.fields(settings)}
+    if "batch_size" in names and settings.batch_size == 0:
+        small.pop("batch_size")
+    return dataclasses.replace(settings, **{name: value for name, value in small.items() if name in names})
+
+
+def small_run(method: str = "pcil", task: str = POINT_MASS, reward: dict[str, Any] | None = None, **changes: Any) -> Run:
+    """A run of six episodes on the point mass, two of them before the first update."""
+    run = presets.make(task, method)
+    settings = {
+        "frames": 300,
+        "seed_frames": 100,
+        "random_frames": 100,
+        "evaluate_every": 100,
+        "evaluate_episodes": 2,
+        "agent": narrow(run.agent),
+        "reward": narrow(run.reward, **(reward or {})),
+    }
+    return dataclasses.replace(run, **{**settings, **changes})
+
+
+def save_point_mass_demos(folder: Path, episodes: int = 4) -> str:
+    """Demonstrations of the optimal policy as a Minari dataset; returns its path."""
+    recorded = demos.record(
+        lambda obs: PointMass.optimal_action(obs).astype(np.float32),
+        envs.make(POINT_MASS),
+        episodes,
+        task=POINT_MASS,
+        seed=7,
+        info={"expert": "the optimal policy"},
+    )
+    return str(recorded.save(folder / "point_mass-v0"))
+
+
+def random_batch(rows: int, obs_dim: int, action_dim: int, seed: int = 0) -> Batch:
+    """Standard normal states and uniform actions."""
+    rng = np.random.default_rng(seed)
+    obs = rng.standard_normal((rows, obs_dim), dtype=np.float32)
+    return Batch(obs, rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32))

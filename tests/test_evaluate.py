@@ -1,0 +1,109 @@
+"""Laws of evaluation: episodes in lockstep are the episodes one by one, and each starts from a seed of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from pcil.evaluate import Evaluation, evaluate
+from pcil.seeds import Stream, episode_seed
+
+
+class Walk(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A random walk of `length` steps pushed by the action; its noise comes from the seed of the reset."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, length: int, *, terminates: bool = False) -> None:
+        self.length, self.terminates, self.seeds = length, terminates, []
+        self.position, self.left = 0.0, 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.seeds.append(seed)
+        self.position, self.left = self.np_random.normal(), self.length
+        return self.observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        assert self.left > 0, "stepped after its end"
+        assert action.shape == (1,)
+        self.position += float(action[0]) + self.np_random.normal()
+        self.left -= 1
+        over = self.left == 0
+        return self.observe(), self.position / 3, over and self.terminates, over and not self.terminates, {}
+
+    def observe(self) -> np.ndarray:
+        return np.array([self.position, self.left], np.float32)
+
+
+def policy(obs: np.ndarray) -> np.ndarray:
+    return np.tanh(obs[..., :1] * np.float32(-0.7))
+
+
+def one_by_one(environments: list[Walk], seed: int) -> tuple[list[float], list[int]]:
+    """The second implementation: one episode after the other, one observation at a time."""
+    returns, lengths = [], []
+    for i, env in enumerate(environments):
+        obs, _ = env.reset(seed=episode_seed(seed, Stream.EVALUATE, i))
+        rewards, over = [], False
+        while not over:
+            obs, reward, terminated, truncated, _ = env.step(policy(obs))
+            rewards.append(reward)
+            over = terminated or truncated
+        returns.append(sum(rewards))
+        lengths.append(len(rewards))
+    return returns, lengths
+
+
+def walks(*lengths: int) -> list[Walk]:
+    return [Walk(length, terminates=i % 2 == 0) for i, length in enumerate(lengths)]
+
+
+@pytest.mark.parametrize("lengths", [(3, 1, 5, 5, 2), (4,), (1, 1, 1), (1, 2, 3, 4), (4, 3, 2, 1)])
+def test_in_lockstep_as_one_by_one(lengths: tuple[int, ...]) -> None:
+    result = evaluate(policy, walks(*lengths), seed=3)
+    returns, steps = one_by_one(walks(*lengths), seed=3)
+    assert result.returns.dtype == np.float64
+    assert result.returns.tolist() == returns
+    assert result.lengths.tolist() == steps == list(lengths)
+    assert result.mean == np.mean(returns)
+    assert result.seconds > 0
+
+
+def test_only_those_still_running_are_asked_for_an_action() -> None:
+    asked = []
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        asked.append(obs[:, 1].tolist())
+        return policy(obs)
+
+    evaluate(act, walks(3, 1, 4), seed=0)
+    assert asked == [[3, 1, 4], [2, 3], [1, 2], [1]]  # the steps that each running episode has left
+
+
+def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
+    environments = walks(3, 4)
+    first, again, other = (evaluate(policy, environments, seed=seed) for seed in (1, 1, 2))
+    assert first.returns.tolist() == again.returns.tolist()
+    assert not set(first.returns.tolist()) & set(other.returns.tolist())
+
+
+def test_every_episode_has_a_seed_of_its_own_that_does_not_depend_on_how_many_there_are() -> None:
+    few, many = [Walk(2) for _ in range(3)], [Walk(2) for _ in range(10)]
+    short, long = evaluate(policy, few, seed=5), evaluate(policy, many, seed=5)
+    assert [env.seeds for env in many] == [[episode_seed(5, Stream.EVALUATE, i)] for i in range(10)]
+    assert len({env.seeds[0] for env in many}) == len(set(long.returns.tolist())) == 10
+    assert short.returns.tolist() == long.returns.tolist()[:3]
+
+
+def test_a_policy_that_returns_too_few_actions_is_noticed() -> None:
+    with pytest.raises(ValueError):
+        evaluate(lambda obs: policy(obs)[:-1], walks(2, 2), seed=0)
+
+
+def test_the_mean_is_over_episodes() -> None:
+    assert Evaluation(np.array([1.0, 2.0, 6.0]), np.array([1, 1, 1]), 0.5).mean == 3.0

@@ -1,0 +1,321 @@
+"""The loop: reproducible, and a run that was stopped anywhere equals one that never was, bit for bit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pcil import checkpoint, learner, loop, runs
+from pcil.config import Run
+from pcil.errors import InputError
+from pcil.metrics import WALL_CLOCK
+from pcil.policy import load_policy
+from pcil.types import Batch, Spec, Window
+from small import POINT_MASS, narrow, random_batch, save_point_mass_demos, small_run
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
+
+
+class StopAfter(runs.Silent):
+    """Asks to stop after so many episodes; remembers what it was told."""
+
+    def __init__(self, episodes: int) -> None:
+        self.left, self.said = episodes, []
+
+    def stop(self) -> bool:
+        self.left -= 1
+        return self.left == 0
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+
+def rows(folder: Path) -> tuple[list[list[str]], list[dict[str, Any]]]:
+    """`eval.csv` and `train.jsonl` without their wall-clock columns."""
+    table = [line.split(",")[:-1] for line in (folder / "eval.csv").read_text().splitlines()]
+    lines = [json.loads(line) for line in (folder / "train.jsonl").read_text().splitlines()]
+    return table, [{name: value for name, value in line.items() if name not in WALL_CLOCK} for line in lines]
+
+
+def same_run(one: Path, two: Path) -> None:
+    """Logs, policy and everything learned are equal, bit for bit."""
+    assert rows(one) == rows(two)
+    first, second = (checkpoint.restore(folder / "checkpoint")[0] for folder in (one, two))
+    assert first is not None and second is not None and first.keys() == second.keys()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    obs = random_batch(5, 2, 2).obs
+    assert np.array_equal(load_policy(one)(obs), load_policy(two)(obs))
+
+
+def finish(run: Run, folder: Path, stops: tuple[int, ...] = ()) -> None:
+    """Run to the end, stopping after so many episodes in each session before the last."""
+    for episodes in stops:
+        with pytest.raises(loop.Stopped):
+            runs.execute(run, folder, StopAfter(episodes))
+    runs.execute(run, folder, runs.Silent())
+
+
+CASES = [("pcil", "sampled"), ("pcil", "stored"), ("dac", "sampled"), ("expert", "stored")]
+
+
+@pytest.mark.parametrize(("method", "label"), CASES)
+def test_a_stopped_run_equals_an_uninterrupted_one(method: str, label: str, demos: str, tmp_path: Path) -> None:
+    run = small_run(method, label=label, demos=demos)
+    finish(run, tmp_path / "whole")
+    finish(run, tmp_path / "stopped", stops=(1, 2, 1))
+    same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+def test_another_seed_gives_another_run(demos: str, tmp_path: Path) -> None:
+    for seed in (1, 2):
+        finish(small_run(seed=seed, demos=demos), tmp_path / str(seed))
+    assert rows(tmp_path / "1") != rows(tmp_path / "2")
+
+
+def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path) -> None:
+    """A crash loses the episodes since the checkpoint; their rows are cut off and written again, not twice."""
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "whole")
+
+    class Crash(StopAfter):
+        """Saves once, then dies two episodes later."""
+
+        def stop(self) -> bool:
+            return self.left <= 0 and self._die()
+
+        def episode(self, run: Run, frames: int, total_reward: float) -> None:
+            self.left -= 1
+            if self.left == -2:
+                raise RuntimeError("the power went")
+
+        def _die(self) -> bool:
+            return False
+
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "crashed", StopAfter(2))
+    with pytest.raises(RuntimeError, match="power"):
+        runs.execute(run, tmp_path / "crashed", Crash(0))
+    finish(run, tmp_path / "crashed")
+    same_run(tmp_path / "whole", tmp_path / "crashed")
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_said(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos, checkpoint_seconds=0.0)
+    finish(run, tmp_path / "whole")
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "torn", StopAfter(4))
+    newest = max((tmp_path / "torn" / "checkpoint").iterdir(), key=lambda path: int(path.name))
+    (newest / "meta.json").write_bytes((newest / "meta.json").read_bytes()[:-20])
+    listener = StopAfter(-1)
+    runs.execute(run, tmp_path / "torn", listener)
+    assert any("damaged" in text for text in listener.said) and any("Resuming at 150" in text for text in listener.said)
+    same_run(tmp_path / "whole", tmp_path / "torn")
+
+
+def test_kill_9_at_any_moment_loses_nothing(demos: str, tmp_path: Path) -> None:
+    """The same command again and again, killed three times in between, ends as the run that was left alone."""
+    words = f"train {POINT_MASS} --demos {demos} --frames 1500 --seed-frames 100 --random-frames 100 --evaluate-every 300"
+    words += " --agent.hidden 16 --reward.hidden 16 --agent.batch-size 32 --reward.batch-size 32 --checkpoint-seconds 0 --out "
+    command = [sys.executable, "-m", "pcil", *words.split()]
+    subprocess.run([*command, "whole"], check=True, stdout=subprocess.DEVNULL)
+    whole_rows = len(rows(tmp_path / "whole")[1])
+    for episodes in (1, 9, 17):
+        process = subprocess.Popen([*command, "killed"], stdout=subprocess.DEVNULL)
+        log = tmp_path / "killed" / "train.jsonl"
+        while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= episodes):
+            time.sleep(0.01)
+        assert process.poll() is None, "the run must still be going when it is killed"
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    subprocess.run([*command, "killed"], check=True, stdout=subprocess.DEVNULL)
+    assert whole_rows == 30
+    same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_stop_cleanly_and_say_how_to_go_on(number: int, code: int, demos: str, tmp_path: Path) -> None:
+    words = (
+        f"train {POINT_MASS} --demos {demos} --frames 1000000 --seed-frames 100 --agent.hidden 16 --reward.hidden 16 --out run"
+    )
+    process = subprocess.Popen([sys.executable, "-m", "pcil", *words.split()], stdout=subprocess.PIPE, text=True)
+    log = tmp_path / "run" / "train.jsonl"
+    while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= 3):
+        time.sleep(0.02)
+    process.send_signal(number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "same command goes on" in output
+    assert list((tmp_path / "run" / "checkpoint").iterdir())
+
+
+def test_a_finished_run_says_so_and_trains_no_more(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "run")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").glob("*.*")}
+    result = runs.execute(run, tmp_path / "run", runs.Silent())
+    assert {path: path.read_bytes() for path in (tmp_path / "run").glob("*.*")} == before
+    assert result.final_return == np.mean([float(row[2]) for row in rows(tmp_path / "run")[0][-2:]])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"seed": 2}, "seed was 1, now 2"),
+        ({"frames": 400}, "frames was 300, now 400"),
+        ({"agent": "gamma"}, "agent.gamma was 0.99, now 0.9"),
+        ({"num_demos": 2}, "num_demos was None, now 2"),
+    ],
+)
+def test_a_changed_setting_is_refused_with_the_difference(
+    change: dict[str, Any], said: str, demos: str, tmp_path: Path
+) -> None:
+    run = small_run(demos=demos)
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", StopAfter(1))
+    if change == {"agent": "gamma"}:
+        change = {"agent": dataclasses.replace(run.agent, gamma=0.9)}
+    with pytest.raises(InputError, match=said):
+        runs.execute(dataclasses.replace(run, **change), tmp_path / "run", runs.Silent())
+
+
+def test_how_often_to_save_may_change(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", StopAfter(1))
+    runs.execute(dataclasses.replace(run, checkpoint_seconds=1.0), tmp_path / "run", runs.Silent())
+    assert (tmp_path / "run" / "DONE").exists()
+
+
+def test_other_demonstrations_under_the_same_name_are_refused(tmp_path: Path) -> None:
+    path = save_point_mass_demos(tmp_path, episodes=2)
+    run = small_run(demos=path)
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", StopAfter(1))
+    Path(path).rename(tmp_path / "old")
+    save_point_mass_demos(tmp_path, episodes=3)
+    with pytest.raises(InputError, match=r"demos.hash was"):
+        runs.execute(run, tmp_path / "run", runs.Silent())
+
+
+def test_folders_that_cannot_be_used_are_refused(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="can't be written"):
+        runs.execute(run, tmp_path / "file", runs.Silent())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("mine")
+    with pytest.raises(InputError, match=r"holds something else \(thesis.tex\)"):
+        runs.execute(run, tmp_path / "full", runs.Silent())
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd" / "run.json").write_text("[]")
+    with pytest.raises(InputError, match="can't be read"):
+        runs.execute(run, tmp_path / "odd", runs.Silent())
+    assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
+
+
+def test_two_processes_never_share_a_folder(demos: str, tmp_path: Path) -> None:
+    class Intruder(runs.Silent):
+        """Starts the same run inside the run."""
+
+        def stop(self) -> bool:
+            with pytest.raises(InputError, match="Another process is training"):
+                runs.execute(small_run(demos=demos), tmp_path / "run", runs.Silent())
+            return True
+
+    with pytest.raises(loop.Stopped):
+        runs.execute(small_run(demos=demos), tmp_path / "run", Intruder())
+
+
+def test_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(
+    demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = small_run(demos=demos, checkpoint_seconds=0.0)
+    finish(run, tmp_path / "whole")
+    save, left = checkpoint.save, [2]
+
+    def save_until_full(*arguments: Any) -> None:
+        if not left[0]:
+            raise OSError(28, os.strerror(28))
+        left[0] -= 1
+        save(*arguments)
+
+    monkeypatch.setattr(checkpoint, "save", save_until_full)
+    with pytest.raises(InputError, match="disk is full"):
+        runs.execute(run, tmp_path / "full", runs.Silent())
+    monkeypatch.undo()
+    finish(run, tmp_path / "full")
+    same_run(tmp_path / "whole", tmp_path / "full")
+
+
+def test_updates_come_when_they_are_due(demos: str, tmp_path: Path) -> None:
+    """300 steps, the first 100 without updates, then one every fourth step."""
+    finish(small_run(demos=demos, update_every=4), tmp_path / "run")
+    _, lines = rows(tmp_path / "run")
+    assert [line["updates"] for line in lines] == [0, 0, 13, 25, 38, 50]
+    assert "agent/critic_loss" not in lines[1] and np.isfinite(lines[2]["agent/critic_loss"])
+
+
+def test_evaluations_come_when_they_are_due(demos: str, tmp_path: Path) -> None:
+    finish(small_run(demos=demos), tmp_path / "run")
+    table, _ = rows(tmp_path / "run")
+    assert [row[0] for row in table[1:]] == ["0", "0", "100", "100", "200", "200", "300", "300"]
+
+
+def _update_once(label: str, task_reward: float) -> Any:
+    """The agent's part after one update on a fixed window whose stored rewards are all `task_reward`."""
+    run = small_run(label=label)
+    spec, demos, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.n_step
+    state = learner.init(run.learner, spec, demos, 0)
+    flat = random_batch(32 * (n + 1), 2, 2, seed=1)
+    obs, action = flat.obs.reshape(32, n + 1, 2), flat.action.reshape(32, n + 1, 2)[:, :n]
+    window = Window(obs, action, np.full((32, n), task_reward, np.float32), np.ones((32, n), np.float32))
+    expert = Batch(demos.obs[:32], demos.action[:32])
+    state, _ = learner.update(run.learner, state, window, expert, np.int32(0), np.int32(0))
+    return np.asarray(state.agent.critic.heads[0].weights[0])
+
+
+def test_sampled_labels_replace_what_is_stored_and_stored_ones_do_not() -> None:
+    assert np.array_equal(_update_once("sampled", 0.0), _update_once("sampled", 5.0))
+    assert not np.array_equal(_update_once("stored", 0.0), _update_once("stored", 5.0))
+
+
+def test_the_actor_that_update_returns_outlives_the_next_update() -> None:
+    """The learner is overwritten in place; the actor that acts meanwhile must not be."""
+    run = small_run("expert")
+    state = learner.init(run.learner, Spec(2, 2, 1), random_batch(0, 2, 2), 0)
+    flat = random_batch(128, 2, 2)
+    obs, action = flat.obs.reshape(32, 4, 2), flat.action.reshape(32, 4, 2)[:, :3]
+    window = Window(obs, action, np.ones((32, 3), np.float32), np.ones((32, 3), np.float32))
+    empty = random_batch(0, 2, 2)
+    state, actor = learner.update(run.learner, state, window, empty, np.int32(0), np.int32(0))
+    host = loop.on_host(actor)
+    before = host.head.weights[0].copy()
+    assert np.array_equal(before, state.agent.actor.head.weights[0])
+    state, newer = learner.update(run.learner, state, window, empty, np.int32(1), np.int32(1))
+    assert np.array_equal(host.head.weights[0], before)
+    assert not np.array_equal(loop.on_host(newer).head.weights[0], before)
+
+
+@pytest.mark.slow
+def test_pcil_learns_the_point_mass_from_demonstrations(demos: str, tmp_path: Path) -> None:
+    """Near the optimal policy's return, and better than random on every start (sign test: 2^-10)."""
+    run = small_run(demos=demos, frames=6000, evaluate_every=6000, evaluate_episodes=10)
+    run = dataclasses.replace(run, agent=narrow(run.agent, hidden=64), reward=narrow(run.reward, hidden=64))
+    finish(run, tmp_path / "run")
+    table, _ = rows(tmp_path / "run")
+    first, last = ([float(row[2]) for row in table[1:] if row[0] == frames] for frames in ("0", "6000"))
+    assert all(after > before for before, after in zip(first, last, strict=True))
+    assert np.mean(last) > 0.9 * runs.demonstrations(run).return_mean

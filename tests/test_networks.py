@@ -1,0 +1,251 @@
+"""Laws of the networks and of exploration: one forward pass in two libraries, orthogonal starts, exact clamps."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pcil.networks import LAYER_NORM_EPSILON, MLP, Actor, Critic, Trunk, unit_sphere
+from pcil.noise import ACTION_MARGIN, LinearSchedule, perturb
+from pcil.optimiser import adam_init, adam_step
+
+law = settings(deadline=None, derandomize=True, max_examples=50)
+OBS_DIM, ACTION_DIM, FEATURES, HIDDEN = 5, 3, 8, 16
+
+
+def randomised(network: eqx.Module, seed: int = 0) -> eqx.Module:
+    """The same network with every number random, so that no bias is 0 and no scale is 1."""
+    rng = np.random.default_rng(seed)
+    draw = lambda leaf: jnp.asarray(rng.normal(size=leaf.shape, scale=0.7), leaf.dtype)  # noqa: E731
+    return jax.tree.map(draw, network)
+
+
+def on_host(network: eqx.Module) -> eqx.Module:
+    return jax.tree.map(np.asarray, network)
+
+
+@functools.cache
+def make_actor() -> Actor:
+    return Actor.init(OBS_DIM, ACTION_DIM, FEATURES, HIDDEN, key=jax.random.key(0))
+
+
+def random_actor() -> Actor:
+    return randomised(make_actor())
+
+
+@functools.cache
+def make_critic() -> Critic:
+    return Critic.init(OBS_DIM, ACTION_DIM, FEATURES, HIDDEN, key=jax.random.key(1))
+
+
+def small_mlp() -> MLP:
+    return MLP.init((3, 7, 2), key=jax.random.key(2))
+
+
+def observations(*shape: int) -> np.ndarray:
+    return np.random.default_rng(7).normal(size=shape, scale=2).astype(np.float32)
+
+
+# --- One forward pass ---
+
+
+@pytest.mark.parametrize("shape", [(OBS_DIM,), (4, OBS_DIM), (2, 3, OBS_DIM)])
+@pytest.mark.parametrize("make", [make_actor, random_actor])
+def test_the_actor_acts_the_same_in_numpy_as_in_jax(make: Callable[[], Actor], shape: tuple[int, ...]) -> None:
+    network, obs = make(), observations(*shape)
+    host = on_host(network)(obs, np)
+    assert isinstance(host, np.ndarray) and host.dtype == np.float32
+    assert host.shape == (*shape[:-1], ACTION_DIM)
+    np.testing.assert_allclose(host, eqx.filter_jit(network)(jnp.asarray(obs)), rtol=0, atol=1e-6)
+    assert np.abs(host).max() <= 1
+
+
+def test_the_actor_is_the_float64_formula() -> None:
+    actor = on_host(random_actor())
+    obs = observations(6, OBS_DIM)
+    x = naive_trunk(actor.trunk, obs)
+    for i, (weight, bias) in enumerate(zip(actor.head.weights, actor.head.biases, strict=True)):
+        x = x @ weight.astype(np.float64) + bias
+        x = np.where(x > 0, x, 0) if i < 2 else np.tanh(x)
+    np.testing.assert_allclose(actor(obs, np), x, rtol=0, atol=1e-5)
+
+
+def naive_trunk(trunk: Trunk, obs: np.ndarray) -> np.ndarray:
+    """Row by row in float64: linear, subtract the mean, divide by the deviation, scale, offset, tanh."""
+    rows = []
+    for row in obs.astype(np.float64):
+        x = row @ np.asarray(trunk.weight, np.float64) + np.asarray(trunk.bias, np.float64)
+        normal = (x - np.mean(x)) / np.sqrt(np.var(x) + LAYER_NORM_EPSILON)
+        rows.append(np.tanh(normal * np.asarray(trunk.scale, np.float64) + np.asarray(trunk.offset, np.float64)))
+    return np.stack(rows)
+
+
+def test_the_trunk_is_a_layer_norm_between_a_linear_layer_and_a_tanh() -> None:
+    trunk, obs = randomised(make_actor().trunk), observations(6, OBS_DIM)
+    np.testing.assert_allclose(trunk(jnp.asarray(obs)), naive_trunk(trunk, obs), rtol=0, atol=1e-6)
+
+
+def test_a_row_does_not_depend_on_the_batch_around_it() -> None:
+    network, obs = random_actor(), observations(4, OBS_DIM)
+    together = np.asarray(network(jnp.asarray(obs)))
+    alone = np.stack([np.asarray(network(jnp.asarray(row))) for row in obs])
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-6)
+
+
+# --- How they start ---
+
+
+@pytest.mark.parametrize("make", [make_actor, make_critic, small_mlp])
+def test_every_linear_layer_starts_orthogonal_and_without_bias(make: Callable[[], eqx.Module]) -> None:
+    network = make()
+    matrices = [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(network) if leaf.ndim == 2]
+    assert len(matrices) >= 2
+    for matrix in matrices:
+        short = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
+        np.testing.assert_allclose(short @ short.T, np.eye(len(short)), atol=1e-5)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(network):
+        if leaf.ndim == 1:
+            np.testing.assert_array_equal(leaf, "scale" in jax.tree_util.keystr(path))
+
+
+def test_no_two_layers_and_no_two_keys_start_alike() -> None:
+    square = MLP.init((6, 6, 6, 6), key=jax.random.key(0))
+    other = MLP.init((6, 6, 6, 6), key=jax.random.key(1))
+    for first, second in itertools.combinations([*square.weights, *other.weights], 2):
+        assert np.abs(np.asarray(first - second)).max() > 0.1
+
+
+def test_the_networks_have_the_sizes_of_drq_v2() -> None:
+    """`algorithms` section 2.1: linear to the features; two hidden layers; the critic's heads see features and action."""
+    actor, critic = make_actor(), make_critic()
+    assert actor.trunk.weight.shape == critic.trunk.weight.shape == (OBS_DIM, FEATURES)
+    assert [w.shape for w in actor.head.weights] == [(FEATURES, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, ACTION_DIM)]
+    for head in critic.heads:
+        assert [w.shape for w in head.weights] == [(FEATURES + ACTION_DIM, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, 1)]
+
+
+# --- The critic ---
+
+
+def test_the_critics_values_differ_and_rest_on_one_trunk() -> None:
+    critic, obs, action = make_critic(), jnp.asarray(observations(4, OBS_DIM)), jnp.asarray(observations(4, ACTION_DIM))
+    first, second = critic(obs, action)
+    assert first.shape == second.shape == (4,)
+    assert np.abs(np.asarray(first - second)).min() > 1e-4
+    for value, from_features in zip((first, second), critic.values(critic.trunk(obs), action), strict=True):
+        np.testing.assert_array_equal(value, from_features)
+    moved = eqx.tree_at(lambda c: c.trunk.offset, critic, critic.trunk.offset + 0.5)
+    for before, after in zip((first, second), moved(obs, action), strict=True):
+        assert np.abs(np.asarray(before - after)).min() > 1e-4
+
+
+@pytest.mark.parametrize("head", [0, 1])
+def test_each_head_changes_its_own_value_alone(head: int) -> None:
+    critic, obs, action = make_critic(), jnp.asarray(observations(4, OBS_DIM)), jnp.asarray(observations(4, ACTION_DIM))
+    moved = eqx.tree_at(lambda c: c.heads[head].biases[-1], critic, jnp.ones(1))
+    change = [np.asarray(after - before) for before, after in zip(critic(obs, action), moved(obs, action), strict=True)]
+    np.testing.assert_allclose(change[head], 1, rtol=1e-5)
+    np.testing.assert_array_equal(change[1 - head], 0)
+
+
+def test_the_action_matters_to_the_value() -> None:
+    critic, obs, action = make_critic(), jnp.asarray(observations(4, OBS_DIM)), jnp.asarray(observations(4, ACTION_DIM))
+    slope = jax.grad(lambda a: jnp.sum(critic(obs, a)[0]))(action)
+    assert np.abs(np.asarray(slope)).max(axis=1).min() > 1e-4
+
+
+# --- The unit sphere ---
+
+
+@law
+@given(st.integers(0, 2**32), st.floats(1e-3, 1e6))
+def test_on_the_unit_sphere_length_is_1_and_direction_is_kept(seed: int, scale: float) -> None:
+    x = np.random.default_rng(seed).normal(size=(3, 4)) * scale
+    result = np.asarray(unit_sphere(jnp.asarray(x, jnp.float32)))
+    np.testing.assert_allclose(np.linalg.norm(result, axis=-1), 1, rtol=1e-5)
+    np.testing.assert_allclose(result, x / np.linalg.norm(x, axis=-1, keepdims=True), atol=1e-5)
+
+
+def test_the_unit_sphere_has_a_value_and_a_slope_at_zero() -> None:
+    zero = jnp.zeros((2, 4))
+    value, slope = unit_sphere(zero), jax.grad(lambda x: jnp.sum(unit_sphere(x)))(zero)
+    np.testing.assert_array_equal(value, 0)
+    assert np.isfinite(slope).all()
+
+
+# --- Exploration ---
+
+
+@pytest.mark.parametrize(("step", "deviation"), [(0, 1.0), (250_000, 0.55), (500_000, 0.1), (10_000_000, 0.1), (-5, 1.0)])
+def test_the_schedule_is_a_line_between_its_ends_and_constant_outside(step: int, deviation: float) -> None:
+    schedule = LinearSchedule(1.0, 0.1, 500_000)
+    assert float(schedule(step, np)) == pytest.approx(deviation, rel=1e-6)
+
+
+@pytest.mark.parametrize("schedule", [LinearSchedule(), LinearSchedule(0.2, 0.2, 0), LinearSchedule(0.1, 0.9, 7)])
+def test_the_schedule_is_the_same_in_numpy_as_in_a_compiled_step(schedule: LinearSchedule) -> None:
+    compiled = jax.jit(schedule)
+    for step in (0, 1, 3, 7, 12_345, 250_000, 499_999, 500_000, 2_000_000):
+        host = schedule(step, np)
+        assert host.dtype == np.float32
+        np.testing.assert_allclose(host, compiled(np.int32(step)), rtol=1e-6)
+
+
+def test_the_schedule_never_turns_back() -> None:
+    values = [float(LinearSchedule(1.0, 0.1, 100)(step, np)) for step in range(120)]
+    assert np.all(np.diff(values) <= 0) and values[0] == 1 and len(set(values)) == 101
+
+
+@law
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-6, 6)), min_size=4, max_size=4))
+def test_a_noisy_action_is_the_sum_clamped_to_the_margin(pairs: list[tuple[float, float]]) -> None:
+    mean, noise = (np.array(column, np.float32) for column in zip(*pairs, strict=True))
+    host = perturb(mean, noise, np)
+    assert host.dtype == np.float32
+    limit = np.float32(1 - ACTION_MARGIN)
+    np.testing.assert_array_equal(host, np.minimum(np.maximum(mean + noise, -limit), limit))
+    compiled = np.asarray(perturb(jnp.asarray(mean), jnp.asarray(noise)))
+    np.testing.assert_allclose(compiled, host, rtol=0, atol=5e-7)
+    assert np.abs(compiled).max() < 1
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, -0.9, 5.0, -5.0])
+def test_the_clamp_passes_the_gradient_straight_through(noise: float) -> None:
+    mean = jnp.array([[0.5, -0.5, 0.999]])
+    to_mean, to_noise = jax.grad(lambda m, e: jnp.sum(perturb(m, e)), (0, 1))(mean, jnp.full((1, 3), noise))
+    np.testing.assert_array_equal(to_mean, 1)
+    np.testing.assert_array_equal(to_noise, 1)
+
+
+# --- The optimiser ---
+
+
+def test_three_steps_are_those_of_adam_written_out() -> None:
+    """Kingma and Ba 2015, Algorithm 1, with its default betas and epsilon, in float64."""
+    rng, network = np.random.default_rng(0), small_mlp()
+    weight, moments = np.asarray(network.weights[0], np.float64), adam_init(network)
+    mean, square = np.zeros_like(weight), np.zeros_like(weight)
+    for step in (1, 2, 3):
+        gradient = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), network)
+        slope = np.asarray(gradient.weights[0], np.float64)
+        mean, square = 0.9 * mean + 0.1 * slope, 0.999 * square + 0.001 * slope**2
+        weight = weight - 1e-2 * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
+        network, moments = adam_step(network, gradient, moments, 1e-2)
+    np.testing.assert_allclose(network.weights[0], weight, rtol=0, atol=1e-6)
+
+
+def test_the_first_step_of_adam_is_the_learning_rate_against_the_gradient() -> None:
+    network = small_mlp()
+    gradient = jax.tree.map(lambda leaf: jnp.full_like(leaf, 7.0), network)
+    moved, _ = adam_step(network, gradient, adam_init(network), 1e-3)
+    for before, after in zip(jax.tree.leaves(network), jax.tree.leaves(moved), strict=True):
+        np.testing.assert_allclose(np.asarray(after - before), -1e-3, rtol=1e-3)

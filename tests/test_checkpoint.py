@@ -16,7 +16,6 @@ import pytest
 from pcil import checkpoint
 from pcil.networks import MLP
 
-
 # Where one array of a damaged checkpoint can't be read, TensorStore reports the others to a loop that is closed.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
@@ -248,8 +247,9 @@ def test_what_a_killed_save_left_is_ignored_and_the_next_save_removes_it(folder:
     assert names(folder) == {"20", "30"}
 
 
-def test_a_save_that_fails_leaves_the_others_as_they_were(folder: Path) -> None:
+@pytest.mark.parametrize("frames", [20, 30])
+def test_a_save_that_fails_leaves_the_others_as_they_were(folder: Path, frames: int) -> None:
     with pytest.raises(TypeError):
-        checkpoint.save(folder, 30, make_arrays(30), {"not json": object()})
+        checkpoint.save(folder, frames, make_arrays(30), {"not json": object()})
     arrays, counters, complaints = checkpoint.restore(folder)
     assert same(arrays, make_arrays(20)) and counters == COUNTERS and complaints == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -133,6 +133,21 @@ def test_a_torn_row_at_the_end_goes_with_the_rewinding(tmp_path: Path) -> None:
             file.write(b'{"fra')
     with writer(tmp_path, positions, 1000):
         assert contents(tmp_path) == whole
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:5])], ids=["gone", "cut"])
+def test_where_a_file_lost_its_rows_nothing_is_made_up_for_them(tmp_path: Path, damage: Callable) -> None:
+    with writer(tmp_path) as log:
+        log.evaluation(0, 0.0, make_evaluation(1.0))
+        log.episode(0, {"return": 1.0})
+        positions, before = log.positions(), contents(tmp_path)
+    for name in NAMES:
+        damage(tmp_path / name)
+    left = {name: (tmp_path / name).read_bytes() if (tmp_path / name).exists() else b"" for name in NAMES}
+    with writer(tmp_path, positions, 1000):
+        header = b"frames,episode,return,length,seconds\n"
+        assert contents(tmp_path) == {"eval.csv": left["eval.csv"] or header, "train.jsonl": left["train.jsonl"]}
+    assert all(before[name].startswith(content) for name, content in contents(tmp_path).items())
 
 
 def test_a_run_that_starts_anew_starts_with_empty_files_and_one_header(tmp_path: Path) -> None:

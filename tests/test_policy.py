@@ -93,6 +93,7 @@ def test_a_save_that_fails_leaves_the_policy_that_was_there(folder: Path) -> Non
     with pytest.raises(TypeError):
         Policy(other.actor, other.task, {"not json": object()}).save(folder)
     np.testing.assert_array_equal(load_policy(folder).actor.trunk.weight, make_policy().actor.trunk.weight)
+    assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "policy.json"}
 
 
 def test_the_files_hold_numbers_and_text_and_no_code(saved: Path) -> None:

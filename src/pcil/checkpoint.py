@@ -24,18 +24,19 @@ def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) ->
     import orbax.checkpoint as ocp
 
     final, partial = folder / str(frames), folder / f"partial-{frames}"
-    for path in (final, *folder.glob("partial-*")):
-        shutil.rmtree(path, ignore_errors=True)
+    for leftover in folder.glob("partial-*"):
+        shutil.rmtree(leftover)
     partial.mkdir(parents=True)
     ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
     meta = {"counters": counters, "checksums": {name: _checksum(array) for name, array in arrays.items()}}
     text = json.dumps(meta)
     (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
+    shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
     others = _newest_first(folder)
     kept = others[others.index(final) :][:KEEP]
     for path in set(others) - set(kept):
-        shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(path)
 
 
 def restore(folder: Path) -> tuple[Arrays | None, dict[str, Any], list[str]]:

@@ -25,7 +25,7 @@ class MetricWriter:
         from tensorboardX import SummaryWriter
 
         self._files = {name: self._open(folder / name, positions.get(name, 0)) for name in ("eval.csv", "train.jsonl")}
-        if not positions.get("eval.csv"):
+        if not self._files["eval.csv"].tell():
             self._write("eval.csv", ",".join(EVAL_COLUMNS) + "\n")
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=frames or None)
 
@@ -65,8 +65,7 @@ class MetricWriter:
     @staticmethod
     def _open(path: Path, position: int) -> io.BufferedRandom:
         file = path.open("r+b" if path.exists() else "w+b")
-        file.truncate(position)
-        file.seek(position)
+        file.truncate(file.seek(min(position, path.stat().st_size)))  # a file that lost its end is not filled with zeros
         return file
 
     def _write(self, name: str, text: str) -> None:

@@ -47,8 +47,8 @@ class Policy:
 
         folder.mkdir(parents=True, exist_ok=True)
         arrays = {name: np.ascontiguousarray(array) for name, array in _named(self.actor).items()}
-        save_file(arrays, folder / "policy.safetensors.tmp")
         text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
+        save_file(arrays, folder / "policy.safetensors.tmp")
         (folder / "policy.json.tmp").write_text(text + "\n")
         for name in ("policy.safetensors", "policy.json"):
             (folder / f"{name}.tmp").replace(folder / name)

@@ -3,6 +3,7 @@
 import os
 
 os.environ.setdefault("MUJOCO_GL", "disabled")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads only wait for each other; XLA has threads of its own
 
 from jaxtyping import install_import_hook
 

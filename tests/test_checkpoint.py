@@ -191,6 +191,9 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
     "half of meta.json": lambda path: cut(path / "meta.json", 0.5),
     "nothing in meta.json": lambda path: cut(path / "meta.json", 0),
     "the meta.json of another": lambda path: shutil.copy(path.parent / "10" / "meta.json", path / "meta.json"),
+    "another digit in meta.json": lambda path: (path / "meta.json").write_text(
+        (path / "meta.json").read_text().replace('"frames": 20', '"frames": 21')
+    ),
     "no arrays": lambda path: shutil.rmtree(path / "arrays"),
     "nothing in arrays": lambda path: emptied(path / "arrays"),
     "the arrays of another": lambda path: (

@@ -18,6 +18,7 @@ from pcil import losses
 
 law = settings(deadline=None, derandomize=True, max_examples=30)
 info_nce = jax.jit(losses.info_nce, static_argnums=3)
+info_nce_slopes = jax.jit(jax.grad(losses.info_nce, (1, 2), has_aux=True), static_argnums=3)
 gradient_penalty = jax.jit(losses.gradient_penalty, static_argnums=0)
 interpolate = jax.jit(losses.interpolate)
 binary_cross_entropy = jax.jit(losses.binary_cross_entropy)
@@ -131,10 +132,7 @@ def test_a_step_against_the_gradient_draws_the_positive_in_and_pushes_every_nega
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
         anchor, positive, negatives = (jnp.asarray(unit_rows(rng, rows, 4)) for rows in (1, 1, 6))
-        slopes, _ = jax.jit(jax.grad(info_nce, (1, 2), has_aux=True), static_argnums=3)(
-            anchor, positive, negatives, temperature
-        )
-        to_positive, to_negatives = slopes
+        (to_positive, to_negatives), _ = info_nce_slopes(anchor, positive, negatives, temperature)
         assert float(anchor[0] @ -to_positive[0]) > 0
         assert np.all(np.asarray(-to_negatives @ anchor[0]) < 0)
 

@@ -269,6 +269,16 @@ def test_a_restored_replay_goes_on_as_the_first_would_have(before: list, after: 
         np.testing.assert_array_equal(a, b, err_msg=name)
 
 
+def test_loading_replaces_all_that_a_replay_held() -> None:
+    replay, naive = fill(25, (7, True), (4, False))
+    used, _ = fill(25, (3, True), (2, True), (9, False))
+    used.sample(np.random.default_rng(0), 5, 3)
+    used.load(replay.state())
+    assert used.num_windows(3) == len(naive.windows(3))
+    drawn = check(used.sample(np.random.default_rng(0), 200, 3), naive.windows(3), 200, 3)
+    assert set(drawn) == set(naive.windows(3))
+
+
 def test_a_state_holds_the_rows_in_use_and_no_others() -> None:
     replay, _ = fill(1000, (5, True), (6, False))
     state = replay.state()

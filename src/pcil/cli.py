@@ -2,11 +2,13 @@
 
 import importlib
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from pcil import arguments
 from pcil.errors import InputError
 
 if TYPE_CHECKING:
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 on bad input, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
+    # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(_overview())
@@ -27,10 +31,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
         return COMMANDS[words[0]](words[1:])
     except InputError as error:
-        print(f"pcil: {error}", file=sys.stderr)
+        sentence = " ".join(str(error).split())  # what a library said may have line breaks
+        print(f"pcil: {sentence.removesuffix('.')}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("pcil: stopped; the same command goes on from the last checkpoint.", file=sys.stderr)
+        again = "; the same command goes on from the last checkpoint" if words[0] == "train" else ""
+        print(f"pcil: stopped{again}.", file=sys.stderr)
         return 130
     except BrokenPipeError:
         return 141
@@ -42,28 +48,24 @@ def _overview() -> str:
     return "\n".join([*lines, "", "pcil COMMAND --help tells more; pcil --version prints the version."])
 
 
-def _parse(name: str, function: Callable[..., int], words: list[str]) -> int:
-    import tyro
-
-    return tyro.cli(function, prog=f"pcil {name}", args=words)
-
-
 def _train(words: list[str]) -> int:
     """Train a policy, or resume where a run stopped."""
+    import dataclasses
+
     import tyro
 
     from pcil import envs, presets
     from pcil.config import Run
 
-    given = _peek(words)
+    given = arguments.peek(words)
     task = envs.task_name(given.get("task", "walker_walk"))
-    changes = {}
+    changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
     if "reward" in given:
         changes["reward"] = _load_reward(given["reward"])
-        words = _take_option(words, "reward")
+        words = arguments.without(words, "reward")
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
     if "task" not in given and not {"-h", "--help"} & set(words):
-        raise InputError(f"Which task? Name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
+        raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
 
     def train(out: Path, run: Annotated[Run, tyro.conf.arg(name="")] = default) -> int:
         """Train a policy, or resume where a run stopped.
@@ -74,34 +76,9 @@ def _train(words: list[str]) -> int:
         Args:
             out: The run's folder; one that holds the same run resumes it.
         """
-        return _run(run, out)
+        return _run(dataclasses.replace(run, task=task), out)
 
-    return _parse("train", train, words)
-
-
-def _peek(words: list[str]) -> dict[str, str]:
-    """The values of the options as they are given, before the method has decided which options there are."""
-    given, rest = {}, iter(words)
-    for word in rest:
-        if word.startswith("--") and "=" in word:
-            name, value = word[2:].split("=", 1)
-            given[name] = value
-        elif word.startswith("--"):
-            given[word[2:]] = next(rest, "")
-        elif not word.startswith("-"):
-            given["task"] = word
-    return given
-
-
-def _take_option(words: list[str], name: str) -> list[str]:
-    """`words` without `--name VALUE` and `--name=VALUE`."""
-    left, rest = [], iter(words)
-    for word in rest:
-        if word == f"--{name}":
-            next(rest, None)
-        elif not word.startswith(f"--{name}="):
-            left.append(word)
-    return left
+    return arguments.call("train", train, words)
 
 
 def _run(run: "Run", out: Path) -> int:
@@ -150,11 +127,13 @@ def _load_reward(spec: str) -> Any:
     sys.path.insert(0, "")
     try:
         kind = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(f"--reward {spec!r} can't be loaded ({error}); it must look like my.module:MyReward.") from error
-    if not (isinstance(kind, type) and issubclass(kind, Reward)):
-        raise InputError(f"--reward {spec!r} is no subclass of pcil.Reward.")
-    return kind()
+        if not (isinstance(kind, type) and issubclass(kind, Reward)):
+            raise TypeError(f"{name} is no subclass of pcil.Reward")
+        return kind()
+    except Exception as error:  # the module is a person's own and may raise anything
+        raise InputError(
+            f"--reward {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like my.module:MyReward."
+        ) from error
 
 
 def _evaluate(words: list[str]) -> int:
@@ -181,8 +160,8 @@ def _evaluate(words: list[str]) -> int:
         from pcil.evaluate import evaluate as roll_out
         from pcil.policy import load_policy
 
-        if episodes < 1:
-            raise InputError(f"--episodes is {episodes}; it must be at least 1.")
+        _at_least(1, episodes=episodes)
+        _at_least(0, seed=seed)
         policy = load_policy(folder)
         result = roll_out(policy, [envs.make(policy.task) for _ in range(episodes)], seed=seed)
         row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
@@ -194,7 +173,7 @@ def _evaluate(words: list[str]) -> int:
             print("  " + "  ".join(f"{value:.1f}" for value in result.returns))
         return 0
 
-    return _parse("evaluate", evaluate, words)
+    return arguments.call("evaluate", evaluate, words)
 
 
 def _demos(words: list[str]) -> int:
@@ -214,21 +193,11 @@ def _demos(words: list[str]) -> int:
         if json_output:
             print(json.dumps(rows))
             return 0
-        columns = [
-            "task",
-            "observation_dim",
-            "action_dim",
-            "episodes",
-            "return_mean",
-            "return_std",
-            "expert",
-            "frames",
-            "seeds_tried",
-        ]
-        _print_table(columns, rows)
+        sizes, returns = ["observation_dim", "action_dim", "episodes"], ["return_mean", "return_std"]
+        _print_table(["task", *sizes, *returns, "expert", "frames", "seeds_tried"], rows)
         return 0
 
-    return _parse("demos", demos, words)
+    return arguments.call("demos", demos, words)
 
 
 def _record(words: list[str]) -> int:
@@ -248,6 +217,8 @@ def _record(words: list[str]) -> int:
         from pcil.policy import load_policy
         from pcil.runs import provenance
 
+        _at_least(1, episodes=episodes)
+        _at_least(0, seed=seed)
         policy = load_policy(folder)
         info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed} --out {out}")
         recorded = demos.record(
@@ -263,7 +234,7 @@ def _record(words: list[str]) -> int:
         print(f"{episodes} episodes of {policy.task}, return {recorded.return_mean:.1f} +- {recorded.return_std:.1f}: {path}")
         return 0
 
-    return _parse("record", record, words)
+    return arguments.call("record", record, words)
 
 
 def _bench(words: list[str]) -> int:
@@ -291,7 +262,7 @@ def _bench(words: list[str]) -> int:
         print(json.dumps(figures) if json_output else bench.table(figures))
         return 0
 
-    return _parse("bench", bench, words)
+    return arguments.call("bench", bench, words)
 
 
 def _doctor(words: list[str]) -> int:
@@ -303,16 +274,23 @@ def _doctor(words: list[str]) -> int:
 
         return doctor.report()
 
-    return _parse("doctor", doctor, words)
+    return arguments.call("doctor", doctor, words)
+
+
+def _at_least(least: int, **options: int) -> None:
+    for name, value in options.items():
+        if value < least:
+            raise InputError(f"--{name} is {value}; it must be at least {least}.")
 
 
 def _print_table(columns: list[str], rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(*columns)
     for row in rows:
-        table.add_row(*(f"{row[c]:.1f}" if isinstance(row[c], float) else str(row[c]) for c in columns))
+        table.add_row(*(Text(f"{row[c]:.1f}" if isinstance(row[c], float) else str(row[c])) for c in columns))
     Console().print(table)
 
 

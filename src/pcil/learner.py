@@ -30,14 +30,17 @@ class Learner(eqx.Module):
     """Sums of the metrics since they were last read, and under "updates" how many."""
 
 
-def init(method: Method, spec: Spec, demos: Batch, seed: int) -> Learner:
+@functools.partial(jax.jit, static_argnames=("method", "spec"))
+def init(method: Method, spec: Spec, demos: Batch, seed: int | Array) -> Learner:
     """The state before the first update."""
     root = jax.random.key_data(jax.random.key(seed))
     key = jax.random.wrap_key_data(root)
     agent = method.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
     reward = method.reward.init(demos, frozen_embed(method, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
-    window = Window(*(jnp.zeros((method.agent.batch_size, *tail)) for tail in _window_shapes(method.agent.n_step, spec)))
+    n, rows = method.agent.n_step, method.agent.batch_size
+    shapes = (n + 1, spec.obs_dim), (n, spec.action_dim), (n,), (n,)
+    window = Window(*(jnp.zeros((rows, *shape)) for shape in shapes))
     expert = Batch(*(jnp.zeros((method.reward.batch_size, size)) for size in (spec.obs_dim, spec.action_dim)))
     metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, jnp.int32(0), jnp.int32(0))[1]
     return eqx.tree_at(lambda s: s.totals, learner, {name: jnp.zeros(()) for name in [*sorted(metrics), "updates"]})
@@ -87,7 +90,3 @@ def label_episode(
     embed = frozen_embed(method, learner.agent)
     learned = label(method.reward, learner.reward, obs, action, task_reward, embed, key=key)
     return learned, pearson(learned, task_reward)
-
-
-def _window_shapes(n: int, spec: Spec) -> tuple[tuple[int, ...], ...]:
-    return (n + 1, spec.obs_dim), (n, spec.action_dim), (n,), (n,)

@@ -22,7 +22,7 @@ class _TimeLeft(ProgressColumn):
         rate = task.fields["rate"]
         if not rate or task.total is None:
             return Text("--:-- left", style="progress.remaining")
-        left = int((task.total - task.completed) / rate)
+        left = max(int((task.total - task.completed) / rate), 0)  # the last episode may go past the end
         return Text(f"{left // 60:d}:{left % 60:02d} left", style="progress.remaining")
 
 

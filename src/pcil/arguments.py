@@ -1,0 +1,79 @@
+"""From the words of a command to a function's arguments, by `tyro`; what does not fit is one sentence, not a framed box."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import re
+from collections.abc import Callable
+from typing import Any
+
+from pcil.errors import InputError
+
+
+def call(name: str, function: Callable[..., int], words: list[str]) -> int:
+    """Call `function` with the arguments that `words` give, or show its help and return 0.
+
+    `InputError` says what does not fit. `tyro` prints that in a box on standard error and exits; only its parsing is listened
+    to, so what `function` itself writes there goes there at once.
+    """
+    import tyro
+
+    @functools.wraps(function)
+    def bind(*positional: Any, **named: Any) -> Callable[[], int]:
+        return functools.partial(function, *positional, **named)
+
+    if {"-h", "--help"} & set(words):
+        words = ["--help"]  # tyro's help leaves out the positional arguments that it has read before
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            bound = tyro.cli(bind, prog=f"pcil {name}", args=words)
+    except SystemExit as end:
+        if not end.code:
+            return 0
+        raise InputError(f"{_complaint(box.getvalue())}; pcil {name} --help tells more.") from None
+    return bound()
+
+
+def peek(words: list[str]) -> dict[str, str]:
+    """The values of the options as they are given, before the method has decided which options there are."""
+    given, rest = {}, iter(words)
+    for word in rest:
+        if word.startswith("--") and "=" in word:
+            name, value = word[2:].split("=", 1)
+            given[name] = value
+        elif word.startswith("--"):
+            given[word[2:]] = next(rest, "")
+        elif not word.startswith("-"):
+            given["task"] = word
+    return given
+
+
+def without(words: list[str], name: str) -> list[str]:
+    """`words` without `--name VALUE` and `--name=VALUE`."""
+    left, rest = [], iter(words)
+    for word in rest:
+        if word == f"--{name}":
+            next(rest, None)
+        elif not word.startswith(f"--{name}="):
+            left.append(word)
+    return left
+
+
+def _complaint(box: str) -> str:
+    """What `tyro` says in a box, with the option that was meant: the rows up to the first rule, then that option.
+
+    The frame depends on the terminal: lines and colours, or blanks. Help texts are indented by 8.
+    """
+    plain = re.sub(r"\x1b\[[\d;]*m", "", box)
+    rows = [row.rstrip(" │") for row in re.findall(r"^[│ ] (.*)$", plain, flags=re.MULTILINE)]
+    rule = next((i for i, row in enumerate(rows) if row and not row.strip("─-")), len(rows))
+    wrong = " ".join(row.strip() for row in rows[:rule] if row.strip() and not row.startswith(" " * 8))
+    wrong = wrong.rstrip(".").replace(". E", "; e") or "The arguments do not fit"
+    meant = dict(zip(rows[rule + 1 :], rows[rule + 2 :], strict=False))
+    for header, words in (("Argument helptext:", "it takes"), ("Perhaps you meant:", "perhaps you meant")):
+        if header in meant:
+            wrong += f"; {words} {meant[header].strip()}"
+    return wrong

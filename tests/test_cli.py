@@ -1,0 +1,388 @@
+"""The command line: what is wrong is one sentence and exit code 2, and nothing is written; what is right goes end to end."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pcil
+from pcil import arguments, cli, presets
+from pcil.demos import Demonstrations, shipped_tasks
+from pcil.envs import TASKS
+from pcil.rewards import REWARDS
+from small import POINT_MASS, save_point_mass_demos
+
+NARROW = """
+    --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --agent.hidden 16
+    --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
+""".split()
+"""`small.small_run` in words, so that both share one compilation."""
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
+
+
+@pytest.fixture(scope="module")
+def trained(demos: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A finished run, and what its training printed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        assert cli.main(["train", POINT_MASS, "--demos", demos, *NARROW, "--out", str(folder)]) == 0
+    return folder, output.getvalue()
+
+
+@pytest.fixture
+def run(trained: tuple[Path, str], tmp_path: Path) -> Path:
+    """A copy of the finished run that may be damaged, as `run` in the present folder."""
+    return Path(shutil.copytree(trained[0], tmp_path / "run"))
+
+
+def files(folder: Path) -> dict[str, bytes | None]:
+    """Everything below `folder`; the value of a folder is None."""
+    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What the command says as it refuses: one sentence on standard error alone, with every file as it was."""
+    before = files(Path.cwd())
+    assert cli.main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("pcil: ") and err.endswith(".\n") and err.count("\n") == 1, err
+    assert not re.search(r"[.!?] [A-Z]|Traceback|[─│╭]", err), "one sentence, no box"
+    assert files(Path.cwd()) == before
+    return err
+
+
+# --- Bad input ---
+
+
+def test_an_unknown_command_names_the_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(["trian", "walker_walk"], capsys)
+    assert "'trian'" in said and all(name in said for name in cli.COMMANDS)
+
+
+def test_an_unknown_task_names_the_ten(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(["train", "walker_wlak", "--out", "new"], capsys)
+    assert "'walker_wlak'" in said and all(task in said for task in TASKS) and "did you mean 'walker_walk'?" in said
+
+
+def test_an_unknown_method_names_the_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(["train", "walker_walk", "--method", "gial", "--out", "new"], capsys)
+    assert "'gial'" in said and all(name in said for name in REWARDS)
+
+
+def test_an_unknown_preset_names_the_presets(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(["train", "walker_walk", "--preset=best", "--out", "new"], capsys)
+    assert "'best'" in said and all(name in said for name in presets.PRESETS)
+
+
+TRAIN = [
+    # words after `train`, what the sentence must hold
+    ("--out new", "The task is missing"),
+    ("walker_walk", "Missing from pcil train: --out PATH"),
+    ("walker_walk --out", "Missing value for argument '--out'"),
+    ("walker_walk walker_run --out new", "Unrecognized options"),
+    ("walker_walk --out new --frames many", "Error parsing --frames: .*'many'; it takes --frames INT"),
+    ("walker_walk --out new --frames 1e5", "--frames INT"),
+    ("walker_walk --out new --agent.noise.start=high", "--agent.noise.start FLOAT"),
+    ("walker_walk --out new --framse 5000", "--framse, 5000; perhaps you meant --frames INT"),
+    ("walker_walk --out new --xyz", "Unrecognized options: --xyz"),
+    ("walker_walk --out new --label often", "'often' .*'sampled', 'stored'"),
+    ("walker_walk --out new --frames 1000", "1000 frames .* --frames more than 2000"),
+    ("walker_walk --out new --frames=-1", "-1 frames"),
+    ("walker_walk --out new --seed -1", "seed is -1"),
+    ("walker_walk --out new --evaluate-episodes 0", "evaluate_episodes is 0"),
+    ("walker_walk --out new --agent.batch-size 64", "at most agent.batch_size"),
+    ("walker_walk --out new --num-demos 0", "0 demonstrations of walker_walk"),
+    ("walker_walk --out new --num-demos 99", "99 demonstrations of walker_walk .* 1 to 10"),
+    ("walker_walk --out new --demos nowhere", "'nowhere'"),
+    ("pendulum_swingup --out new --demos walker_walk", "obs of shape .* in this environment"),
+    (f"{POINT_MASS} --out new --demos walker_walk", "obs of shape .* in this environment"),
+    (f"{POINT_MASS} --out new", f"no Minari dataset .*'{POINT_MASS}'"),
+    ("CartPole-v1 --out new", "actions of 'CartPole-v1' must be"),
+    ("walker_walk --out new --reward nonsense", "'nonsense' can't be loaded .* my.module:MyReward"),
+    ("walker_walk --out new --reward=no.such.module:Mine", "ModuleNotFoundError"),
+    ("walker_walk --out new --reward .mine:Mine", "can't be loaded"),
+    ("walker_walk --out new --reward pcil.rewards:Missing", "has no attribute 'Missing'"),
+    ("walker_walk --out new --reward pcil.rewards:Reward", "abstract"),
+    ("walker_walk --out new --reward json:JSONDecoder", "no subclass of pcil.Reward"),
+    ("walker_walk --out new --reward", "'' can't be loaded"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), TRAIN, ids=[words for words, _ in TRAIN])
+def test_train_refuses(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert re.search(said, refused(["train", *words.split()], capsys))
+
+
+OTHERS = [
+    ("evaluate", "Missing from pcil evaluate: PATH"),
+    ("evaluate nowhere", "nowhere holds no policy"),
+    ("evaluate run --episodes 0", "--episodes is 0; it must be at least 1"),
+    ("evaluate run --seed -1", "--seed is -1; it must be at least 0"),
+    ("evaluate run --episodes two", "it takes --episodes INT"),
+    ("record run", "Missing from pcil record: --out PATH"),
+    ("record nowhere --out new", "nowhere holds no policy"),
+    ("record run --out new --episodes 0", "--episodes is 0"),
+    ("record run --out new --seed -1", "--seed is -1"),
+    ("record run --out run", "exists already"),
+    ("record run --out run/run.json/new", "can not be written"),
+    ("record run --out new --episodes 1 --minimum-return 1000", "Only 0 of 10 episodes"),
+    ("demos walker_walk", "Unrecognized options: walker_walk"),
+    ("bench --preset best", "'best'"),
+    ("doctor --json", "Unrecognized options: --json"),
+]
+
+
+@pytest.mark.usefixtures("run")
+@pytest.mark.parametrize(("words", "said"), OTHERS, ids=[words for words, _ in OTHERS])
+def test_other_commands_refuse(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert re.search(said, refused(words.split(), capsys))
+
+
+@pytest.mark.parametrize("words", [["evaluate", "run"], ["record", "run", "--out", "new"]])
+@pytest.mark.parametrize("name", ["policy.safetensors", "policy.json"])
+def test_a_damaged_policy_is_refused(name: str, words: list[str], run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = run / "policy" / name
+    path.write_bytes(path.read_bytes()[:-20])
+    assert "is damaged" in refused(words, capsys)
+
+
+def test_a_folder_with_another_run_is_refused(run: Path, demos: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["train", POINT_MASS, "--demos", demos, *NARROW, "--seed", "2", "--agent.gamma", "0.9", "--out", str(run)]
+    said = refused(words, capsys)
+    assert "seed was 1, now 2" in said and "agent.gamma was 0.99, now 0.9" in said
+
+
+def test_a_folder_with_something_else_is_refused(demos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").write_text("mine")
+    (tmp_path / "thesis" / ".lock").touch()  # made before it is known what else is there
+    assert "thesis.tex" in refused(["train", POINT_MASS, "--demos", demos, *NARROW, "--out", "thesis"], capsys)
+
+
+def test_a_folder_that_cannot_be_made_is_refused(demos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert "file/run can't be written" in refused(["train", POINT_MASS, "--demos", demos, *NARROW, "--out", "file/run"], capsys)
+
+
+def test_a_reward_whose_module_is_broken_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "broken_reward.py").write_text("class Mine(:\n")
+    assert "SyntaxError" in refused(["train", "walker_walk", "--out", "new", "--reward", "broken_reward:Mine"], capsys)
+
+
+def test_recording_never_overwrites_a_dataset(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_point_mass_demos(tmp_path)
+    said = refused(["record", str(run), "--episodes", "1", "--out", "point_mass-v0"], capsys)
+    assert "exists already" in said
+
+
+@pytest.mark.parametrize(("encoding", "columns"), [("utf-8", "200"), ("utf-8", "40"), ("ascii", "40")])
+def test_a_refusal_is_the_same_on_every_terminal(encoding: str, columns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """tyro draws its box by the terminal's width, encoding and colours; none of that may reach the sentence."""
+
+    class Terminal(io.TextIOWrapper):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stdout", Terminal(io.BytesIO(), encoding=encoding))
+    monkeypatch.setattr(sys, "stderr", err := io.StringIO())
+    assert cli.main(["train", "walker_walk", "--out", "x", "--framse", "5"]) == 2
+    options = "Unrecognized options: --framse, 5; perhaps you meant --frames INT"
+    assert err.getvalue() == f"pcil: {options}; pcil train --help tells more.\n"
+
+
+# --- What the words mean ---
+
+
+def test_options_are_seen_before_they_are_parsed() -> None:
+    words = "--seed -1 walker_walk --method=dac --reward.hidden 16 --preset paper".split()
+    given = {"seed": "-1", "task": "walker_walk", "method": "dac", "reward.hidden": "16", "preset": "paper"}
+    assert arguments.peek(words) == given
+
+
+def test_an_option_is_taken_out_with_its_value() -> None:
+    assert arguments.without("a --reward x:Y --reward.hidden 1 --reward=z:Y b".split(), "reward") == [
+        *("a", "--reward.hidden", "1", "b")
+    ]
+
+
+# --- Help ---
+
+
+def test_help_is_an_overview_without_any_heavy_import() -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "pcil", "--help"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    imported = {line.rsplit("|", 1)[-1].strip().partition(".")[0] for line in result.stderr.splitlines()}
+    assert all(f"  {name}" in result.stdout for name in cli.COMMANDS)
+    assert "pcil" in imported and not imported & {"jax", "numpy", "gymnasium", "tyro", "rich", "dm_control", "matplotlib"}
+
+
+def test_no_words_are_a_call_for_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 0
+    assert capsys.readouterr().out.startswith("usage: pcil COMMAND")
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    command = [sys.executable, "-m", "pcil", "--version"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == f"pcil {pcil.__version__}\n"
+
+
+@pytest.mark.parametrize("command", list(cli.COMMANDS))
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([command, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert f"usage: pcil {command}" in out and (cli.COMMANDS[command].__doc__ or "?") in out and err == ""
+
+
+@pytest.mark.parametrize(
+    ("method", "shown", "hidden"),
+    [
+        ("pcil", ["--reward.temperature", "--reward.penalty"], []),
+        ("dac", ["--reward.penalty"], ["--reward.temperature"]),
+        ("expert", ["--reward.task-weight"], ["--reward.penalty", "--reward.temperature"]),
+    ],
+)
+def test_train_help_shows_the_settings_of_the_method(
+    method: str, shown: list[str], hidden: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["train", "hopper_hop", "--method", method, "--preset", "paper", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "(default: hopper_hop)" in out and f"(default: {method})" in out and "2000000" in out
+    assert all(option in out for option in shown) and not any(option in out for option in hidden)
+
+
+def test_a_reward_of_ones_own_brings_its_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that needs whole episodes can be had with `--label stored`, and is refused with the default label."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "reward_of_mine.py").write_text(
+        "from dataclasses import dataclass\n"
+        "from pcil.rewards import TaskReward\n"
+        "@dataclass(frozen=True)\n"
+        "class Mine(TaskReward):\n"
+        "    scope = 'episode'\n"
+        "    strength: float = 0.25\n"
+    )
+    words = ["train", POINT_MASS, "--reward", "reward_of_mine:Mine"]
+    assert "use --label stored" in refused([*words, "--out", "new"], capsys)
+    assert cli.main([*words, "--label", "stored", "--help"]) == 0
+    assert "--reward.strength" in capsys.readouterr().out
+
+
+# --- End to end ---
+
+
+def test_training_ends_with_a_plain_statement(trained: tuple[Path, str], demos: str) -> None:
+    folder, printed = trained
+    final = json.loads((folder / "DONE").read_text())["final_return"]
+    expert = Demonstrations.load(demos).return_mean
+    *progress, statement, policy, curve = printed.splitlines()
+    assert statement == f"Final return {final:.1f}, {final / expert:.0%} of the expert's {expert:.1f} (mean of 2 episodes)."
+    assert policy == f"Policy: {folder / 'policy'}" and (folder / "policy" / "policy.safetensors").exists()
+    assert curve == f"Learning curve: {folder / 'curve.png'}" and (folder / "curve.png").exists()
+    assert [line.split()[0] for line in progress] == ["0", "100", "200", "300"]
+
+
+def test_the_same_command_again_says_that_it_is_done(run: Path, demos: str, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = {name: data for name, data in files(run).items() if name != "curve.png"}
+    assert cli.main(["train", POINT_MASS, "--demos", demos, *NARROW, "--out", str(run)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"The run in {run} is done.\nFinal return ")
+    assert {name: data for name, data in files(run).items() if name != "curve.png"} == logs
+
+
+def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) -> None:
+    """Short and long names of a task are one task, and Python's defaults are the command line's."""
+    settings = json.loads((run / "run.json").read_text())["run"]
+    made = presets.make(POINT_MASS, demos=demos)
+    assert {**made.to_json(), "agent": 0, "reward": 0} | {
+        name: settings[name] for name in ("frames", "seed_frames", "random_frames", "evaluate_every", "evaluate_episodes")
+    } == {**settings, "agent": 0, "reward": 0}
+
+
+def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+    monkeypatch.setattr(cli, "_run", lambda run, out: runs.append(run) or 0)
+    assert cli.main("train dmc/walker_walk-v0 --out new".split()) == 0
+    assert cli.main("train --out new walker_walk".split()) == 0
+    assert runs[0] == runs[1] == presets.make("walker_walk")
+
+
+def test_evaluate_prints_json_and_nothing_else(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", str(run), "--episodes", "3", "--seed", "5"]
+    assert cli.main([*words, "--json"]) == 0
+    row = json.loads(capsys.readouterr().out)
+    assert list(row) == ["task", "episodes", "seed", "return_mean", "return_std", "returns"]
+    assert (row["task"], row["episodes"], row["seed"]) == (POINT_MASS, 3, 5)
+    assert len(row["returns"]) == 3 and len(set(row["returns"])) == 3
+    assert np.isclose(row["return_mean"], np.mean(row["returns"])) and np.isclose(row["return_std"], np.std(row["returns"]))
+
+    assert cli.main(words) == 0
+    assert capsys.readouterr().out.startswith(
+        f"{POINT_MASS}: return {row['return_mean']:.1f} +- {row['return_std']:.1f} over 3"
+    )
+
+
+def test_what_is_recorded_can_be_trained_from(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["record", str(run), "--episodes", "2", "--seed", "3", "--out", "mine/point-v0"]) == 0
+    recorded = Demonstrations.load("mine/point-v0")
+    returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
+    assert capsys.readouterr().out == f"2 episodes of {POINT_MASS}, return {returns}: {tmp_path / 'mine' / 'point-v0'}\n"
+    assert recorded.task == POINT_MASS and len(recorded.episodes) == 2
+    assert recorded.info["expert"] == "pcil, 300 frames, seed 1" and recorded.info["run"]["agent"]["hidden"] == 16
+
+    assert cli.main(["train", POINT_MASS, "--demos", "mine/point-v0", *NARROW, "--out", "second"]) == 0
+    assert f"of the expert's {recorded.return_mean:.1f}" in capsys.readouterr().out
+    about = json.loads((tmp_path / "second" / "run.json").read_text())
+    assert about["demos"] == {"hash": recorded.hash, "episodes": 2, "return_mean": recorded.return_mean}
+
+
+def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demos", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["task"] for row in rows] == shipped_tasks()
+    for row in rows:
+        assert {"task", "episodes", "steps", "return_mean", "return_std", "expert", "hash"} <= set(row)
+        assert row["steps"] == 500 * row["episodes"] and len(row["hash"]) == 64
+
+
+def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a dataset says of itself is shown as it is: brackets are no markup."""
+    monkeypatch.setenv("COLUMNS", "300")
+    row = {"task": "mine", "observation_dim": 2, "action_dim": 2, "episodes": 3, "return_mean": 41.26, "return_std": 0.5}
+    shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None}
+    monkeypatch.setattr("pcil.demos.shipped", lambda: [shown])
+    assert cli.main(["demos"]) == 0
+    out = capsys.readouterr().out
+    assert "me [/bold] [red]" in out and "41.3" in out
+
+
+# --- Stopping ---
+
+
+@pytest.mark.parametrize(("name", "said"), [("train", "stopped; the same command goes on"), ("evaluate", "pcil: stopped.")])
+def test_interrupts_exit_with_130(
+    name: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(words: list[str]) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli.COMMANDS, name, interrupt)
+    assert cli.main([name]) == 130
+    assert said in capsys.readouterr().err

@@ -16,9 +16,6 @@ import pytest
 from pcil import checkpoint
 from pcil.networks import MLP
 
-# Where one array of a damaged checkpoint can't be read, TensorStore reports the others to a loop that is closed.
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-
 
 class Learned(eqx.Module):
     """A stand-in for a learner: networks, moments, key data, a counter on the device, and settings that are no arrays."""

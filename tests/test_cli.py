@@ -21,10 +21,30 @@ from pcil.envs import TASKS
 from pcil.rewards import REWARDS
 from small import POINT_MASS, save_point_mass_demos
 
-NARROW = """
-    --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --agent.hidden 16
-    --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
-""".split()
+NARROW = [
+    "--frames",
+    "300",
+    "--seed-frames",
+    "100",
+    "--random-frames",
+    "100",
+    "--evaluate-every",
+    "100",
+    "--evaluate-episodes",
+    "2",
+    "--agent.hidden",
+    "16",
+    "--agent.feature-dim",
+    "8",
+    "--agent.batch-size",
+    "32",
+    "--agent.noise.steps",
+    "1000",
+    "--reward.hidden",
+    "16",
+    "--reward.batch-size",
+    "32",
+]
 """`small.small_run` in words, so that both share one compilation."""
 
 
@@ -210,13 +230,13 @@ def test_a_refusal_is_the_same_on_every_terminal(encoding: str, columns: str, mo
 
 
 def test_options_are_seen_before_they_are_parsed() -> None:
-    words = "--seed -1 walker_walk --method=dac --reward.hidden 16 --preset paper".split()
+    words = ["--seed", "-1", "walker_walk", "--method=dac", "--reward.hidden", "16", "--preset", "paper"]
     given = {"seed": "-1", "task": "walker_walk", "method": "dac", "reward.hidden": "16", "preset": "paper"}
     assert arguments.peek(words) == given
 
 
 def test_an_option_is_taken_out_with_its_value() -> None:
-    assert arguments.without("a --reward x:Y --reward.hidden 1 --reward=z:Y b".split(), "reward") == [
+    assert arguments.without(["a", "--reward", "x:Y", "--reward.hidden", "1", "--reward=z:Y", "b"], "reward") == [
         *("a", "--reward.hidden", "1", "b")
     ]
 
@@ -319,8 +339,8 @@ def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) ->
 def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
     monkeypatch.setattr(cli, "_run", lambda run, out: runs.append(run) or 0)
-    assert cli.main("train dmc/walker_walk-v0 --out new".split()) == 0
-    assert cli.main("train --out new walker_walk".split()) == 0
+    assert cli.main(["train", "dmc/walker_walk-v0", "--out", "new"]) == 0
+    assert cli.main(["train", "--out", "new", "walker_walk"]) == 0
     assert runs[0] == runs[1] == presets.make("walker_walk")
 
 

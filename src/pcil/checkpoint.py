@@ -1,4 +1,4 @@
-"""Checkpoints between episodes: arrays by Orbax, counters by JSON, a checksum over both; the two newest are kept."""
+"""Checkpoints between episodes: arrays by Orbax, counters by JSON, a checksum of every file; the two newest are kept."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) ->
         shutil.rmtree(leftover)
     partial.mkdir(parents=True)
     ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
-    meta = {"counters": counters, "checksums": {name: _checksum(array) for name, array in arrays.items()}}
-    text = json.dumps(meta)
+    text = json.dumps({"counters": counters, "files": _checksums(partial / "arrays")})
     (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
     shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
@@ -46,7 +45,7 @@ def restore(folder: Path) -> tuple[Arrays | None, dict[str, Any], list[str]]:
         try:
             arrays, counters = _read(path)
         except Exception as error:  # whatever a torn file makes Orbax raise, the next older checkpoint is the answer
-            complaints.append(f"The checkpoint {path} is damaged ({_first_line(error)}); using the one before it.")
+            complaints.append(f"The checkpoint {path} is damaged ({_first_line(error)}) and is passed over.")
         else:
             return arrays, counters, complaints
     return None, {}, complaints
@@ -81,21 +80,22 @@ def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
     if zlib.crc32(text.encode()) != int(crc):
         raise ValueError("the checksum of meta.json is wrong")
     meta = json.loads(text)
-    arrays = {k: np.asarray(v) for k, v in ocp.PyTreeCheckpointer().restore((path / "arrays").absolute()).items()}
-    if set(arrays) != set(meta["checksums"]):
-        raise ValueError("arrays are missing")
-    for name, expected in meta["checksums"].items():
-        if _checksum(arrays[name]) != expected:
-            raise ValueError(f"the checksum of {name} is wrong")
-    return arrays, meta["counters"]
+    found = _checksums(path / "arrays")
+    for name, expected in meta["files"].items():
+        if found.get(name) != expected:
+            raise ValueError(f"{name} is {'missing' if name not in found else 'not what was written'}")
+    arrays = ocp.PyTreeCheckpointer().restore((path / "arrays").absolute())
+    return {name: np.asarray(array) for name, array in arrays.items()}, meta["counters"]
 
 
 def _newest_first(folder: Path) -> list[Path]:
     return sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name), reverse=True)
 
 
-def _checksum(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).tobytes() + f"{array.dtype}{array.shape}".encode())
+def _checksums(arrays: Path) -> dict[str, int]:
+    """CRC-32 of each file that Orbax wrote, so that damage is known before Orbax reads it."""
+    files = sorted(path for path in arrays.rglob("*") if path.is_file())
+    return {str(path.relative_to(arrays)): zlib.crc32(path.read_bytes()) for path in files}
 
 
 def _first_line(error: Exception) -> str:

@@ -97,7 +97,7 @@ def _run(run: "Run", out: Path) -> int:
             return 128 + int(bar.signal or 0)
         if not bar.evaluations:
             bar.say(f"The run in {out} is done.")
-        share = f", {result.final_return / expert:.0%} of the expert's {expert:.1f}" if expert else ""
+        share = f", {progress.compared(result.final_return, expert)}" if expert is not None else ""
         bar.say(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
         bar.say(f"Policy: {out / 'policy'}")
         _draw_curve(out, expert, bar)

@@ -26,6 +26,12 @@ class _TimeLeft(ProgressColumn):
         return Text(f"{left // 60:d}:{left % 60:02d} left", style="progress.remaining")
 
 
+def compared(value: float, expert: float) -> str:
+    """A return beside the expert's; the share is said only where returns are positive, since elsewhere it means nothing."""
+    share = f"{value / expert:.0%} of " if expert > 0 else ""
+    return f"{share}the expert's {expert:.1f}"
+
+
 class Bar:
     """Reports a run to the terminal. Ctrl-C or SIGTERM ends it after the episode at hand; a second Ctrl-C at once."""
 
@@ -68,7 +74,7 @@ class Bar:
     def evaluation(self, run: Run, frames: int, result: Evaluation) -> None:
         """One line for each evaluation, beside the expert's return."""
         self.evaluations.append((frames, result.mean))
-        against = f" (expert {self._expert:.1f}, {result.mean / self._expert:.0%})" if self._expert else ""
+        against = f" ({compared(result.mean, self._expert)})" if self._expert is not None else ""
         low, high = result.returns.min(), result.returns.max()
         self.say(f"{frames:>9,} frames  return {result.mean:7.1f}  [{low:.1f}, {high:.1f}]{against}")
         self._update(run, frames)
@@ -87,7 +93,7 @@ class Bar:
 
     def _returns(self, total_reward: float) -> str:
         last = f"return {total_reward:.0f}"
-        return f"{last} of {self._expert:.0f}" if self._expert else last
+        return f"{last} of {self._expert:.0f}" if self._expert is not None else last
 
     def _ask(self, number: int, frame: FrameType | None) -> None:
         del frame

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 
+from pcil.report.load import Point, read_run
+
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-
-Curve = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Frames, mean, lowest and highest return, one number an evaluation."""
 
 INK, GREY = "#1b1b1b", "#808080"
 COLOURS = {
@@ -28,64 +25,76 @@ COLOURS = {
 }
 
 
-def read_curve(path: Path) -> Curve:
-    """An `eval.csv`, one point for each evaluation: its mean, lowest and highest episode."""
-    with path.open() as file:
-        rows = [(int(row["frames"]), float(row["return"])) for row in csv.DictReader(file)]
-    frames = np.array(sorted({frame for frame, _ in rows}))
-    groups = [np.array([value for f, value in rows if f == frame]) for frame in frames]
-    mean, low, high = (np.array([reduce(group) for group in groups]) for reduce in (np.mean, np.min, np.max))
-    return frames, mean, low, high
-
-
 def run_curve(folder: Path, expert_return: float | None) -> Path:
     """Draw one run's learning curve as `curve.png` in its folder, and return that path."""
-    run = json.loads((folder / "run.json").read_text())["run"]
-    frames, mean, low, high = read_curve(folder / "eval.csv")
-    colour = COLOURS.get(run["method"], INK)
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    axes.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
-    axes.plot(frames, mean, color=colour, marker="o", markersize=3, label="mean")
+    points = read_run(folder)
+    task, method, preset, seed = points[0][:4]
+    frames = [point.frames for point in points]
+    figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
+    low, high = [point.return_low for point in points], [point.return_high for point in points]
+    colour = COLOURS.get(method, INK)
+    axis.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
+    axis.plot(frames, [point.return_mean for point in points], color=colour, marker="o", markersize=3, label="mean")
     if expert_return is not None:
-        axes.axhline(expert_return, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert_return:.0f}")
-    _finish(axes, f"{run['task']} - {run['method']} ({run['preset']}, seed {run['seed']})")
+        axis.axhline(expert_return, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert_return:.0f}")
+    _finish(axis, f"{task} - {method} ({preset}, seed {seed})")
     path = folder / "curve.png"
     figure.savefig(path, dpi=150)
     plt.close(figure)
     return path
 
 
-def grid(panels: Sequence[tuple[str, dict[str, Sequence[Curve]], float | None]], path: Path, columns: int = 3) -> Path:
-    """Small multiples: a panel `(title, curves by method, expert's return)` each, mean over seeds with every seed behind it."""
-    rows = -(-len(panels) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4 * columns, 2.9 * rows), layout="constrained", squeeze=False)
-    for axis in axes.flat[len(panels) :]:
+def grid(points: Sequence[Point], path: Path, columns: int = 3) -> Path:
+    """A panel for each task: the mean over seeds of each method and variant, every seed behind it, and the expert's return.
+
+    Written as PNG and PDF; returns the PNG's path.
+    """
+    tasks = list(dict.fromkeys(point.task for point in points))
+    columns = min(columns, len(tasks))
+    rows = -(-len(tasks) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.4 * columns, 3.2 * rows), layout="constrained", squeeze=False)
+    for axis in axes.flat[len(tasks) :]:
         axis.axis("off")
-    for axis, (title, methods, expert_return) in zip(axes.flat, panels, strict=False):
-        for method, curves in methods.items():
-            _plot_seeds(axis, method, curves)
-        if expert_return is not None:
-            axis.axhline(expert_return, color=GREY, linestyle="--", linewidth=1, label="expert")
-        _finish(axis, title)
+    for axis, task in zip(axes.flat, tasks, strict=False):
+        _panel(axis, task, [point for point in points if point.task == task])
     path.parent.mkdir(parents=True, exist_ok=True)
-    for ending in (".png", ".pdf"):
-        figure.savefig(path.with_suffix(ending), dpi=130, metadata={"CreationDate": None} if ending == ".pdf" else None)
+    figure.savefig(path.with_suffix(".png"), dpi=130)
+    figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
     plt.close(figure)
     return path.with_suffix(".png")
 
 
-def _plot_seeds(axis: Axes, method: str, curves: Sequence[Curve]) -> None:
-    colour = COLOURS.get(method, INK)
-    for frames, mean, _, _ in curves:
-        axis.plot(frames, mean, color=colour, alpha=0.35, linewidth=0.8)
-    shortest = min(len(frames) for frames, *_ in curves)
-    middle = np.mean([mean[:shortest] for _, mean, _, _ in curves], axis=0)
-    axis.plot(curves[0][0][:shortest], middle, color=colour, linewidth=1.8, label=f"{method} ({len(curves)} seeds)")
+def _panel(axis: Axes, task: str, points: Sequence[Point]) -> None:
+    variants = list(dict.fromkeys((point.method, point.variant) for point in points))
+    methods = [method for method, _ in variants]
+    for index, (method, variant) in enumerate(variants):
+        alone = methods.count(method) == 1
+        colour = COLOURS.get(method, INK) if alone else plt.get_cmap("tab10")(index)
+        mine = [point for point in points if (point.method, point.variant) == (method, variant)]
+        _seeds(axis, mine, colour, method if alone else f"{method}, {variant}")
+    experts = {point.expert_return for point in points} - {None}
+    for expert in experts:
+        axis.axhline(expert, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert:.0f}")
+    _finish(axis, task)
+
+
+def _seeds(axis: Axes, points: Sequence[Point], colour: object, name: str) -> None:
+    """Each seed as a thin line, and their mean as far as the shortest reaches."""
+    seeds = list(dict.fromkeys(point.seed for point in points))
+    curves = [[(p.frames, p.return_mean) for p in points if p.seed == seed] for seed in seeds]
+    for curve in curves:
+        axis.plot(*zip(*curve, strict=True), color=colour, alpha=0.4, linewidth=0.8)
+    shortest = min(len(curve) for curve in curves)
+    mean = np.mean([[value for _, value in curve[:shortest]] for curve in curves], axis=0)
+    plural = "s" if len(seeds) > 1 else ""
+    label = f"{name} ({len(seeds)} seed{plural})"
+    axis.plot([frames for frames, _ in curves[0][:shortest]], mean, color=colour, linewidth=1.8, label=label)
 
 
 def _finish(axis: Axes, title: str) -> None:
     axis.set(title=title, xlabel="frames (environment control steps)", ylabel="return")
-    axis.set_ylim(bottom=0)
+    if axis.dataLim.y0 >= 0:  # most tasks' returns; some Gymnasium environments pay less than nothing
+        axis.set_ylim(bottom=0)
     axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3), useMathText=True)
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, fontsize=8)

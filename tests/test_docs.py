@@ -1,0 +1,230 @@
+"""The docs say what the code does: names exist, tables equal the settings, the example runs, pages are fresh."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pcil import checkpoint, learner, presets
+from pcil.agents import DrQV2
+from pcil.config import Run
+from pcil.rewards import DAC, PCIL, Reward
+from pcil.types import Batch, Spec, Window
+from small import narrow, random_batch, small_run
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+NAME = re.compile(r"`(pcil(?:\.\w+)*):(\w+(?:\.\w+)*)`")
+TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
+LINK = re.compile(r"\]\((?!https?:)([^)\s]+)\)")
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [text for kind, text in BLOCK.findall(page.read_text()) if kind == language]
+
+
+def exists(module: str, name: str) -> bool:
+    """Whether `module:name` is there; a dataclass's field counts even if it has no value on the class."""
+    found: Any = importlib.import_module(module)
+    for part in name.split("."):
+        if part in getattr(found, "__dataclass_fields__", {}):
+            return True
+        if not hasattr(found, part):
+            return False
+        found = getattr(found, part)
+    return True
+
+
+def test_every_name_in_the_docs_exists() -> None:
+    named = {match for page in PAGES for match in NAME.findall(page.read_text())}
+    assert len(named) > 50
+    assert [f"{module}:{name}" for module, name in sorted(named) if not exists(module, name)] == []
+
+
+def test_every_test_in_the_docs_exists() -> None:
+    named = {match for page in PAGES for match in TEST.findall(page.read_text())}
+    assert len(named) > 40
+    functions = {
+        path: {node.name for node in ast.parse((ROOT / path).read_text()).body if isinstance(node, ast.FunctionDef)}
+        for path in {path for path, _ in named}
+    }
+    assert [f"{path}::{name}" for path, name in sorted(named) if name not in functions[path]] == []
+
+
+def test_every_equation_has_a_function_and_a_test_or_is_said_to_be_missing() -> None:
+    tables = [line for line in (ROOT / "docs/paper-map.md").read_text().splitlines() if line.startswith("| ")]
+    rows = [line for line in tables if "| Function |" not in line and len(line.split(" | ")) == 4]
+    assert len(rows) > 25
+    bare = [row for row in rows if not (NAME.search(row) and TEST.search(row)) and "Not implemented" not in row]
+    assert bare == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in LINK.findall(page.read_text()):
+        path, _, anchor = target.partition("#")
+        goal = (page.parent / path).resolve() if path else page
+        assert goal.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", goal.read_text(), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}, target
+
+
+def settings_tables() -> list[tuple[str, list[list[str]]]]:
+    """Class and rows of every table with a header such as `| setting | PCIL | default | paper | released | meaning |`."""
+    found = []
+    for page in sorted((ROOT / "docs" / "methods").glob("*.md")):
+        for header, body in re.findall(r"^\| setting \| (\w+) \|.*\n\|[-|]+\n((?:\|.*\n)+)", page.read_text(), re.MULTILINE):
+            found.append((header, [[cell.strip() for cell in row.strip("|").split("|")] for row in body.splitlines()]))
+    return found
+
+
+def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
+    """Every setting by its name on the command line, nested ones with dots."""
+    values = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        nested = flat(value, f"{prefix}{field.name}.") if dataclasses.is_dataclass(value) else {prefix + field.name: value}
+        values |= nested
+    return values
+
+
+def of(run: Run, kind: str) -> dict[str, Any]:
+    """The settings of a run that a table of this class lists."""
+    if kind == "DrQV2":
+        return flat(run.agent)
+    if kind in ("PCIL", "DAC"):
+        return flat(run.reward)
+    return {
+        name: value
+        for name, value in flat(run).items()
+        if "." not in name and name not in ("task", "method", "preset") and not hasattr(value, "__dataclass_fields__")
+    }
+
+
+def cell_value(cell: str, task: str) -> Any:
+    """What a cell says for a task: `3; walker 1` is 1 for the walker and 3 for others."""
+    general, _, special = cell.partition("; walker ")
+    return ast.literal_eval(special if special and task.startswith("walker") else general)
+
+
+def test_the_settings_tables_say_what_the_code_says() -> None:
+    """Every field is there, and its default and its value in each preset are as written."""
+    tables = settings_tables()
+    assert sorted(kind for kind, _ in tables) == ["DAC", "DrQV2", "PCIL", "Run"]
+    bare = {"PCIL": PCIL(), "DAC": DAC(), "DrQV2": DrQV2()}
+    for kind, rows in tables:
+        method = "dac" if kind == "DAC" else "pcil"
+        names = [row[0].strip("`") for row in rows]
+        own = flat(bare[kind]) if kind in bare else of(Run(task="finger_spin"), kind)
+        assert sorted(names) == sorted(own), kind
+        for name, row in zip(names, rows, strict=True):
+            assert cell_value(row[1], "finger_spin") == own[name], f"{kind}.{name}"
+            for cell, preset in zip(row[2:5], ("default", "paper", "released"), strict=True):
+                for task in ("finger_spin", "walker_walk"):
+                    expected = of(presets.make(task, method, preset), kind)[name]
+                    assert cell_value(cell, task) == expected, f"{kind}.{name}, {preset}, {task}"
+
+
+def load_example(folder: Path, monkeypatch: pytest.MonkeyPatch) -> type[Reward]:
+    """The example reward of architecture.md, imported as a user's module would be."""
+    (text,) = blocks(ROOT / "docs" / "architecture.md", "python")
+    (folder / "nearest_example.py").write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setitem(sys.modules, "nearest_example", None)
+    monkeypatch.delitem(sys.modules, "nearest_example")
+    return importlib.import_module("nearest_example").NearestExpert
+
+
+def test_the_example_reward_is_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a naive second computation; 0 at an expert state, and states come back from a checkpoint."""
+    settings = load_example(tmp_path, monkeypatch)(num_states=10)
+    demos, states = random_batch(40, 3, 1, seed=1), random_batch(7, 3, 1, seed=2)
+
+    def embed(obs: Any) -> Any:
+        return obs
+
+    state = settings.init(demos, embed, key=jax.random.key(0))
+    got = settings.reward(state, jnp.asarray(states.obs), jnp.asarray(states.action), embed, key=jax.random.key(1))
+    spread = demos.obs.std(axis=0) + 1e-3
+    naive = [-min(np.linalg.norm((s - e) / spread) for e in demos.obs[::4]) for s in states.obs]
+    assert got.shape == (7,) and np.allclose(got, naive, atol=1e-3)
+    at_expert = settings.reward(state, jnp.asarray(demos.obs[:1]), jnp.zeros((1, 1)), embed, key=jax.random.key(1))
+    assert float(at_expert[0]) == pytest.approx(0.0, abs=1e-2)
+    fresh = settings.init(random_batch(40, 3, 1, seed=9), embed, key=jax.random.key(0))
+    restored = checkpoint.unflatten("reward", fresh, checkpoint.flatten("reward", state))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(restored), jax.tree.leaves(state), strict=True))
+
+
+def test_the_example_reward_goes_through_the_compiled_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same `init`, `update` and `label_episode` that train PCIL; the agent is trained on what the example pays."""
+    settings = narrow(load_example(tmp_path, monkeypatch)())
+    run = dataclasses.replace(small_run(), reward=settings)
+    spec, demos, rows, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.batch_size, run.agent.n_step
+    state = learner.init(run.learner, spec, demos, 0)
+    steps = random_batch(rows * (n + 1), 2, 2, seed=1)
+    window = Window(
+        steps.obs.reshape(rows, n + 1, 2),
+        steps.action.reshape(rows, n + 1, 2)[:, :n],
+        np.zeros((rows, n), np.float32),
+        np.ones((rows, n), np.float32),
+    )
+    expert = Batch(demos.obs[: settings.batch_size], demos.action[: settings.batch_size])
+    before = np.asarray(state.agent.critic.heads[0].weights[0])
+    state, actor = learner.update(run.learner, state, window, expert, np.int32(0), np.int32(0))
+    assert not np.array_equal(before, state.agent.critic.heads[0].weights[0])
+    assert float(state.totals["updates"]) == 1 and float(state.totals["agent/target"]) < 0
+    assert actor(jnp.zeros((1, 2))).shape == (1, 2)
+    episode = np.concatenate([demos.obs[:10], demos.obs[:1] + 5])
+    true = np.zeros(10, np.float32)
+    learned, _ = learner.label_episode(run.learner, state, episode, demos.action[:10], true, np.int32(0))
+    assert learned.shape == (10,) and learned.dtype == np.float32
+    assert np.allclose(learned[:9], 0, atol=1e-2) and learned[9] < -1
+
+
+def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`python docs/make_cli.py` mends it."""
+    spec = importlib.util.spec_from_file_location("make_cli", ROOT / "docs" / "make_cli.py")
+    assert spec is not None and spec.loader is not None
+    make_cli = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_cli)
+    for columns in ("60", "200"):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert make_cli.main(["--check"]) == 0
+
+
+def test_every_option_in_the_docs_is_one() -> None:
+    known = set(re.findall(r"--[a-z][\w.-]*", (ROOT / "docs" / "cli.md").read_text()))
+    for page in PAGES:
+        for line in re.findall(r"^.*\bpcil (?:train|evaluate|demos|record|bench|doctor)\b.*$", page.read_text(), re.MULTILINE):
+            assert set(re.findall(r"(?<!\S)--[a-z][\w.-]*\w", line)) <= known, line
+
+
+def test_the_map_in_the_readme_has_every_file_once() -> None:
+    (text,) = (text for text in blocks(ROOT / "README.md", "text") if text.startswith("src/pcil/\n"))
+    mapped = re.findall(r"^  (\S+\.py) ", text, re.MULTILINE)
+    package = ROOT / "src" / "pcil"
+    assert sorted(mapped) == sorted(path.relative_to(package).as_posix() for path in package.rglob("*.py"))
+
+
+def test_the_python_in_the_docs_is_python() -> None:
+    """It compiles, and what it takes from `pcil` is there."""
+    import pcil
+
+    for page in PAGES:
+        for text in blocks(page, "python"):
+            tree = ast.parse(text)
+            used = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and getattr(n.value, "id", "") == "pcil"}
+            assert used <= set(pcil.__all__), page.name

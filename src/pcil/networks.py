@@ -70,8 +70,9 @@ class Trunk(eqx.Module):
 
     def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch features"]:
         x = _add(obs @ self.weight, self.bias)
-        centred = x - x.mean(axis=-1, keepdims=True)
-        variance = (centred * centred).mean(axis=-1, keepdims=True)
+        share = 1 / x.shape[-1]  # NumPy's own mean takes longer than the whole layer
+        centred = x - x.sum(axis=-1, keepdims=True) * share
+        variance = (centred * centred).sum(axis=-1, keepdims=True) * share
         normal = centred / xp.sqrt(variance + LAYER_NORM_EPSILON)
         return xp.tanh(_add(normal * _rows(self.scale, normal), self.offset))
 

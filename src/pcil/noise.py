@@ -23,7 +23,7 @@ class LinearSchedule:
     steps: int = 500_000
 
     def __call__(self, step: Any, xp: ModuleType = jnp) -> Float[Any, ""]:
-        mix = xp.clip(xp.float32(step) / xp.float32(max(self.steps, 1)), 0.0, 1.0)
+        mix = xp.minimum(xp.float32(step) / xp.float32(max(self.steps, 1)), 1.0)
         return xp.float32(self.start) * (1 - mix) + xp.float32(self.end) * mix
 
 
@@ -32,5 +32,5 @@ def perturb(
 ) -> Float[Any, "*batch action"]:
     """`mean + noise`, clamped into the action range; the clamp passes the gradient of `mean` through unchanged."""
     raw = mean + noise
-    clamped = xp.clip(raw, ACTION_MARGIN - 1, 1 - ACTION_MARGIN)
+    clamped = xp.minimum(xp.maximum(raw, ACTION_MARGIN - 1), 1 - ACTION_MARGIN)
     return clamped if xp is not jnp else raw + jax.lax.stop_gradient(clamped - raw)

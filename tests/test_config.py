@@ -1,0 +1,162 @@
+"""Settings: every preset makes a run, the paper's numbers are the paper's, and what can't work is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import pytest
+
+from pcil import presets
+from pcil.agents import DrQV2
+from pcil.config import Run, differences
+from pcil.envs import TASKS
+from pcil.errors import InputError
+from pcil.rewards import REWARDS, TaskReward
+
+EVERY_RUN = sorted(presets.REWARD_SETTINGS)
+
+
+@dataclass(frozen=True)
+class WholeEpisodes(TaskReward):
+    """Like PWIL's reward, it needs the steps of an episode in order."""
+
+    scope: ClassVar[Literal["step", "episode"]] = "episode"
+
+
+def to_json(run: Run) -> dict[str, Any]:
+    """The settings as `run.json` gives them back."""
+    return json.loads(json.dumps(run.to_json()))
+
+
+# --- Presets ---
+
+
+def test_every_method_has_every_preset() -> None:
+    assert set(EVERY_RUN) == {(method, preset) for method in REWARDS for preset in presets.PRESETS}
+
+
+@pytest.mark.parametrize(("method", "preset"), EVERY_RUN)
+def test_a_preset_makes_a_run_that_survives_json(method: str, preset: str) -> None:
+    for task in TASKS:
+        run = presets.make(task, method, preset)
+        assert (run.task, run.method, run.preset) == (task, method, preset)
+        assert type(run.reward) is REWARDS[method]
+        assert to_json(run) == run.to_json()
+        assert differences(to_json(run), run.to_json()) == []
+
+
+@pytest.mark.parametrize(("method", "preset"), EVERY_RUN)
+def test_equal_settings_share_one_compilation(method: str, preset: str) -> None:
+    """What is compiled is found by its hash; seed, frames and task's name are no part of it."""
+    one, two = presets.make("hopper_stand", method, preset), presets.make("hopper_hop", method, preset, seed=7)
+    assert one.learner == two.learner and hash(one.learner) == hash(two.learner)
+    wider = dataclasses.replace(one, agent=dataclasses.replace(one.agent, hidden=512))
+    assert wider.learner != one.learner
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_paper_preset_is_the_papers_table(task: str) -> None:
+    """Appendix B, table of hyperparameters (paper.tex, label table:hyper); the penalty is the authors' agent/pcil.py."""
+    run = presets.make(task, "pcil", "paper")
+    assert isinstance(run.agent, DrQV2)
+    assert run.replay_steps == 500_000
+    assert run.update_every == 2
+    assert run.agent.learning_rate == run.reward.learning_rate == 1e-4
+    assert run.agent.tau == 0.01
+    assert run.agent.batch_size == 128
+    assert run.agent.hidden == run.reward.hidden == 256
+    assert run.reward.batch_size == 256 * 0.5, "discriminator batch of 256, half of it expert data"
+    assert run.reward.temperature == 0.07
+    assert run.reward.penalty == 10
+
+
+def test_the_released_preset_never_applies_the_temperature_and_stores_rewards() -> None:
+    """Authors' agent/pcil.py and train.py."""
+    run = presets.make("walker_walk", "pcil", "released")
+    assert run.reward.temperature == 1 and run.label == "stored"
+    assert run.agent.hidden == run.reward.hidden == 1024 and run.agent.batch_size == 512
+
+
+def test_presets_can_be_changed_in_any_field() -> None:
+    run = presets.make("walker_walk", "dac", "paper", seed=3, frames=5000, label="sampled")
+    assert (run.seed, run.frames, run.label) == (3, 5000, "sampled")
+    assert dataclasses.replace(run, seed=1, frames=2_000_000, label="stored") == presets.make("walker_walk", "dac", "paper")
+
+
+def test_unknown_names_are_refused_with_the_known_ones() -> None:
+    with pytest.raises(InputError, match=r"no method 'gail'.*pcil, dac, expert"):
+        presets.make("walker_walk", "gail")
+    with pytest.raises(InputError, match=r"no preset 'best'.*default, paper, released"):
+        presets.make("walker_walk", "pcil", "best")
+
+
+# --- Differences ---
+
+
+def test_differences_name_what_changed_however_deep() -> None:
+    run = presets.make("walker_walk")
+    agent = dataclasses.replace(run.agent, gamma=0.9, noise=dataclasses.replace(run.agent.noise, steps=7))
+    other = dataclasses.replace(run, seed=2, agent=agent)
+    assert differences(to_json(run), to_json(other)) == [
+        "seed was 1, now 2",
+        "agent.gamma was 0.99, now 0.9",
+        f"agent.noise.steps was {run.agent.noise.steps}, now 7",
+    ]
+
+
+def test_another_reward_is_a_difference_even_where_its_settings_are_equal() -> None:
+    run = presets.make("walker_walk", "expert")
+    found = differences(to_json(run), to_json(dataclasses.replace(run, label="stored", reward=WholeEpisodes())))
+    assert found[-1].startswith("reward.class was pcil.rewards.task:TaskReward, now ") and "WholeEpisodes" in found[-1]
+
+
+def test_fields_that_one_side_lacks_are_differences() -> None:
+    assert differences({"a": 1}, {"b": {"c": 2}}) == ["a was 1, now None", "b was None, now {'c': 2}"]
+
+
+def test_how_often_to_save_is_no_difference() -> None:
+    run = presets.make("walker_walk")
+    assert differences(to_json(run), to_json(dataclasses.replace(run, checkpoint_seconds=1.0))) == []
+
+
+# --- Refusals ---
+
+
+def test_an_episode_reward_cannot_label_samples() -> None:
+    assert presets.make("walker_walk", label="stored", reward=WholeEpisodes()).label == "stored"
+    with pytest.raises(InputError, match=r"WholeEpisodes needs whole episodes.*--label stored"):
+        presets.make("walker_walk", label="sampled", reward=WholeEpisodes())
+
+
+def test_the_rewards_batch_fits_into_the_agents() -> None:
+    run = presets.make("walker_walk")
+    half = dataclasses.replace(run.agent, batch_size=64)
+    smaller = dataclasses.replace(run, agent=half, reward=dataclasses.replace(run.reward, batch_size=64))
+    assert smaller.reward.batch_size == smaller.agent.batch_size
+    with pytest.raises(InputError, match=r"batch of 128 agent steps.*which has 64"):
+        dataclasses.replace(run, agent=half)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad", "good"),
+    [
+        ("frames", 2000, 2001),
+        ("frames", -1, 10_000),
+        ("update_every", 0, 1),
+        ("evaluate_every", 0, 1),
+        ("evaluate_episodes", 0, 1),
+        ("replay_steps", 0, 1),
+        ("seed", -1, 0),
+        ("seed", 2**31, 2**31 - 1),
+    ],
+)
+def test_numbers_out_of_range_are_refused(name: str, bad: int, good: int) -> None:
+    assert getattr(presets.make("walker_walk", **{name: good}), name) == good
+    with pytest.raises(InputError, match=str(bad)) as refusal:
+        presets.make("walker_walk", **{name: bad})
+    sentence = str(refusal.value)
+    assert sentence.endswith(".") and "\n" not in sentence and not math.isnan(good)

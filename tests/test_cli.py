@@ -19,7 +19,7 @@ from pcil import arguments, cli, presets
 from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
 from pcil.rewards import REWARDS
-from small import POINT_MASS, save_point_mass_demos
+from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
     --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --agent.hidden 16
@@ -312,12 +312,7 @@ def test_the_same_command_again_says_that_it_is_done(run: Path, demos: str, caps
 
 
 def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) -> None:
-    """Short and long names of a task are one task, and Python's defaults are the command line's."""
-    settings = json.loads((run / "run.json").read_text())["run"]
-    made = presets.make(POINT_MASS, demos=demos)
-    assert {**made.to_json(), "agent": 0, "reward": 0} | {
-        name: settings[name] for name in ("frames", "seed_frames", "random_frames", "evaluate_every", "evaluate_episodes")
-    } == {**settings, "agent": 0, "reward": 0}
+    assert json.loads((run / "run.json").read_text())["run"] == small_run(demos=demos).to_json()
 
 
 def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,17 +339,17 @@ def test_evaluate_prints_json_and_nothing_else(run: Path, capsys: pytest.Capture
 
 
 def test_what_is_recorded_can_be_trained_from(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["record", str(run), "--episodes", "2", "--seed", "3", "--out", "mine/point-v0"]) == 0
+    assert cli.main(["record", str(run), "--episodes", "4", "--seed", "3", "--out", "mine/point-v0"]) == 0
     recorded = Demonstrations.load("mine/point-v0")
     returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
-    assert capsys.readouterr().out == f"2 episodes of {POINT_MASS}, return {returns}: {tmp_path / 'mine' / 'point-v0'}\n"
-    assert recorded.task == POINT_MASS and len(recorded.episodes) == 2
+    assert capsys.readouterr().out == f"4 episodes of {POINT_MASS}, return {returns}: {tmp_path / 'mine' / 'point-v0'}\n"
+    assert recorded.task == POINT_MASS and len(recorded.episodes) == 4
     assert recorded.info["expert"] == "pcil, 300 frames, seed 1" and recorded.info["run"]["agent"]["hidden"] == 16
 
     assert cli.main(narrow_run("mine/point-v0", "second")) == 0
     assert f"of the expert's {recorded.return_mean:.1f}" in capsys.readouterr().out
     about = json.loads((tmp_path / "second" / "run.json").read_text())
-    assert about["demos"] == {"hash": recorded.hash, "episodes": 2, "return_mean": recorded.return_mean}
+    assert about["demos"] == {"hash": recorded.hash, "episodes": 4, "return_mean": recorded.return_mean}
 
 
 def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:

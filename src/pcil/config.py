@@ -99,6 +99,26 @@ class Run:
         return tree
 
 
+def changed(settings: Any, changes: dict[str, Any]) -> Any:
+    """Settings with some fields changed; a dotted name such as "agent.noise.steps" reaches into nested ones.
+
+    Raises `InputError` for a name that is no field, with the fields that there are.
+    """
+    names = [field.name for field in dataclasses.fields(settings)]
+    own: dict[str, Any] = {}
+    nested: dict[str, dict[str, Any]] = {}
+    for name, value in changes.items():
+        first, _, rest = name.partition(".")
+        if first not in names or (rest and not dataclasses.is_dataclass(getattr(settings, first))):
+            raise InputError(f"{type(settings).__name__} has no setting {name!r}; it has {', '.join(names)}.")
+        if rest:
+            nested.setdefault(first, {})[rest] = value
+        else:
+            own[name] = value
+    own |= {name: changed(own.get(name, getattr(settings, name)), inner) for name, inner in nested.items()}
+    return dataclasses.replace(settings, **own)
+
+
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
     """What differs between two runs' settings, such as "agent.gamma was 0.99, now 0.9"; machine settings don't count."""
     found = []

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pcil.agents import DrQV2
-from pcil.config import Run
+from pcil.config import Run, changed
 from pcil.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, REWARDS, Reward, TaskReward
 from pcil.types import InputError
@@ -93,11 +93,16 @@ REWARD_SETTINGS: dict[tuple[str, str], Reward] = {
 
 
 def make(task: str, method: str = "pcil", preset: str = "default", **changes: Any) -> Run:
-    """The run of a method with a preset, and any field of `Run` changed; unknown names raise `InputError`."""
+    """The run of a method with a preset, and any of its settings changed: `seed=2`, `**{"agent.gamma": 0.98}`.
+
+    Unknown names raise `InputError`.
+    """
     _known("method", method, REWARDS)
     _known("preset", preset, PRESETS)
-    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": REWARD_SETTINGS[method, preset], **changes}
-    return Run(task=task, method=method, preset=preset, **settings)
+    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": REWARD_SETTINGS[method, preset]}
+    plain = {name: value for name, value in changes.items() if name in settings}
+    run = Run(task=task, method=method, preset=preset, **{**settings, **plain})
+    return changed(run, {name: value for name, value in changes.items() if name not in settings})
 
 
 def _known(kind: str, name: str, names: Any) -> None:

@@ -86,8 +86,12 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
             with _full_disk_is_input_error(folder):
                 _, final = loop.train_loop(run, folder, _batch(demos, run), reporter)
                 _write(folder / "DONE", json.dumps({"final_return": final.mean}) + "\n")
-        done = json.loads((folder / "DONE").read_text())
-    return Result(folder, done["final_return"], demos.return_mean if demos else None)
+        return Result(folder, read_done(folder), demos.return_mean if demos else None)
+
+
+def read_done(folder: Path) -> float:
+    """The final return of a finished run: the mean of its last evaluation."""
+    return json.loads((folder / "DONE").read_text())["final_return"]
 
 
 def demonstrations(run: Run) -> Demonstrations | None:

@@ -1,0 +1,59 @@
+"""Train, select and record the experts of experts.toml; run again, it resumes: python experiments/experts.py [TASK ...]"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from pcil import demos, envs, runs
+from pcil.errors import InputError
+from pcil.policy import load_policy
+
+HERE = Path(__file__).parent
+RUNS = Path("runs/experts")
+POLICIES = demos.SHIPPED.parent / "policies"
+EPISODES = 10
+
+
+def main(wanted: list[str]) -> None:
+    """Every task of the file, or those that are wanted."""
+    plan = tomllib.loads((HERE / "experts.toml").read_text())
+    for task in wanted or plan:
+        if task not in plan:
+            raise InputError(f"experts.toml has no {task}; it has {', '.join(plan)}.")
+        ship(task, best(task, dict(plan[task])), len(plan[task]["seeds"]))
+
+
+def best(task: str, settings: dict[str, Any]) -> Path:
+    """The run folder of the seed with the highest final return; whatever is not finished is trained first."""
+    seeds = settings.pop("seeds")
+    del settings["reason"]
+    options = [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    finished = {}
+    for seed in seeds:
+        folder = RUNS / f"{task}-{seed}"
+        command = ["train", task, "--method", "expert", "--seed", str(seed), *options, "--out", str(folder)]
+        subprocess.run([sys.executable, "-m", "pcil", *command], check=True)
+        finished[folder] = runs.read_done(folder)
+    return max(finished, key=lambda folder: finished[folder])
+
+
+def ship(task: str, folder: Path, seeds_tried: int) -> None:
+    """Ten deterministic episodes and the policy into the package, in place of what was there."""
+    policy = load_policy(folder)
+    command = f"python experiments/experts.py {task}"
+    info = runs.provenance(folder, policy, command) | {"seeds_tried": seeds_tried}
+    recorded = demos.record(policy, envs.make(task), EPISODES, task=task, seed=0, info=info)
+    target = demos.SHIPPED / "dmc" / task / "expert-v0"
+    shutil.rmtree(target, ignore_errors=True)
+    recorded.save(target)
+    policy.save(POLICIES / task)
+    print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,61 @@
+"""What ships in the package is what it says: plain Minari reads it, the recorded actions replay, the policies still act so."""
+
+from __future__ import annotations
+
+import minari
+import numpy as np
+import pytest
+
+from pcil import demos, envs
+from pcil.evaluate import evaluate
+from pcil.policy import load_policy
+
+TASKS = demos.shipped_tasks()
+POLICIES = demos.SHIPPED.parent / "policies"
+
+
+def test_the_quickstart_has_its_demonstrations() -> None:
+    assert {"walker_walk", "finger_spin", "hopper_stand"} <= set(TASKS) <= set(envs.TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_plain_minari_reads_ten_episodes_of_the_environments_sizes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(demos.SHIPPED))
+    dataset = minari.load_dataset(f"dmc/{task}/expert-v0")
+    spec = envs.spec(envs.make(task))
+    assert (dataset.total_episodes, dataset.total_steps) == (10, 5000)
+    for episode in dataset.iterate_episodes():
+        assert episode.observations.shape == (501, spec.obs_dim) and episode.actions.shape == (500, spec.action_dim)
+        assert episode.truncations[-1] and not episode.terminations.any()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_one_episode_replays_from_its_seed(task: str) -> None:
+    """The same observations and rewards, bit for bit: dm_control and MuJoCo are pinned for this."""
+    episode = demos.Demonstrations.load(task).episodes[3]
+    env = envs.make(task)
+    obs = [env.reset(seed=episode.seed)[0]]
+    rewards = []
+    for action in episode.action:
+        step = env.step(action)
+        obs.append(step[0])
+        rewards.append(step[1])
+    assert np.array_equal(np.stack(obs), episode.obs)
+    assert np.allclose(rewards, episode.reward, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_policy_still_reaches_the_tables_return(task: str) -> None:
+    """Two episodes, each within four standard deviations (or 5% of the mean) of the demonstrations' mean."""
+    shipped = demos.Demonstrations.load(task)
+    result = evaluate(load_policy(POLICIES / task), [envs.make(task) for _ in range(2)], seed=11)
+    tolerance = max(4 * shipped.return_std, 0.05 * shipped.return_mean)
+    assert np.abs(result.returns - shipped.return_mean).max() < tolerance
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_table_says_where_it_comes_from(task: str) -> None:
+    row = next(row for row in demos.shipped() if row["task"] == task)
+    info = demos.Demonstrations.load(task).info
+    assert row["frames"] >= 100_000 and row["seeds_tried"] >= 1 and len(row["hash"]) == 64
+    assert len(info["commit"].rstrip("+")) == 40 and info["command"] and info["run"]["method"] == "expert"

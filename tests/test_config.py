@@ -87,6 +87,19 @@ def test_presets_can_be_changed_in_any_field() -> None:
     assert dataclasses.replace(run, seed=1, frames=2_000_000, label="stored") == presets.make("walker_walk", "dac", "paper")
 
 
+def test_nested_settings_change_by_dotted_names() -> None:
+    run = presets.make("walker_walk", **{"agent.noise.steps": 7, "agent.gamma": 0.9, "reward.penalty": 0.0, "seed": 3})
+    assert (run.agent.noise.steps, run.agent.gamma, run.reward.penalty, run.seed) == (7, 0.9, 0.0, 3)
+    assert (run.agent.noise.start, run.agent.tau) == (1.0, 0.01), "what is not named stays"
+
+
+@pytest.mark.parametrize("name", ["speed", "agent.speed", "agent.noise.speed", "seed.speed"])
+def test_settings_that_do_not_exist_are_refused_with_those_that_do(name: str) -> None:
+    known = {"agent.speed": "gamma", "agent.noise.speed": "steps"}.get(name, "frames")
+    with pytest.raises(InputError, match=rf"has no setting '\S*speed'; it has .*\b{known}\b.*\.$"):
+        presets.make("walker_walk", **{name: 1})
+
+
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"no method 'gail'.*pcil, dac, expert"):
         presets.make("walker_walk", "gail")

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from pcil.errors import InputError
 from pcil.report import figures
-from pcil.report.load import Point, read_points, read_run, write_points
+from pcil.report.load import Point
 
 EVALUATIONS = """\
 frames,episode,return,length,seconds
@@ -66,55 +65,6 @@ def lines(axes: Axes) -> dict[str, list[float]]:
 def pixels(path: Path) -> np.ndarray:
     """Height x width x colour, from 0 to 1."""
     return matplotlib.image.imread(path)[..., :3]
-
-
-# --- Numbers ---
-
-
-def test_a_run_has_one_point_for_each_evaluation(run: Path) -> None:
-    points = read_run(run)
-    assert [point.frames for point in points] == [0, 1000, 20000]
-    assert [point.return_mean for point in points] == [20.0, 150.5, 7.25]
-    assert [point.return_low for point in points] == [10.0, 100.5, 7.25]
-    assert [point.return_high for point in points] == [30.0, 200.5, 7.25]
-    assert {point[:4] for point in points} == {("walker_walk", "pcil", "default", 3)}
-    assert {(point.expert_return, point.commit) for point in points} == {(960.33, "abc+")}
-
-
-def test_a_variant_is_called_what_one_calls_it(run: Path) -> None:
-    assert {point.variant for point in read_run(run, "temperature 0.07")} == {"temperature 0.07"}
-
-
-def test_a_run_without_demonstrations_has_no_expert(run: Path) -> None:
-    about = json.loads((run / "run.json").read_text())
-    (run / "run.json").write_text(json.dumps(about | {"demos": None, "commit": None}))
-    assert {(point.expert_return, point.commit) for point in read_run(run)} == {(None, "")}
-
-
-def test_points_survive_their_file(run: Path, tmp_path: Path) -> None:
-    points = read_run(run) + curve("finger_spin", "dac", 1, 0.5, expert=None)
-    write_points(tmp_path / "results" / "deep" / "all.csv", points)
-    assert read_points(tmp_path / "results" / "deep" / "all.csv") == points
-
-
-@pytest.mark.parametrize("name", ["run.json", "eval.csv"])
-def test_a_folder_without_a_run_is_refused(name: str, run: Path) -> None:
-    (run / name).unlink()
-    with pytest.raises(InputError, match="holds no run that can be read"):
-        read_run(run)
-
-
-WRONG_SHAPE = pytest.mark.xfail(strict=True, raises=(KeyError, TypeError), reason="load.read_run looks into it unguarded")
-
-
-@pytest.mark.parametrize("text", ["{", pytest.param("[]", marks=WRONG_SHAPE), pytest.param("{}", marks=WRONG_SHAPE)])
-def test_a_damaged_description_is_refused(text: str, run: Path) -> None:
-    (run / "run.json").write_text(text)
-    with pytest.raises(InputError, match="holds no run that can be read"):
-        read_run(run)
-
-
-# --- Pictures ---
 
 
 def test_a_runs_curve_is_a_picture_in_its_folder(run: Path) -> None:

@@ -38,3 +38,21 @@ def test_points_survive_their_file(tmp_path: Path) -> None:
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no run"):
         read_run(tmp_path)
+
+
+def test_a_run_without_demonstrations_has_no_expert(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(about | {"demos": None, "commit": None}))
+    assert {(point.expert_return, point.commit) for point in read_run(folder)} == {(None, "")}
+
+
+WRONG_SHAPE = pytest.mark.xfail(strict=True, raises=(KeyError, TypeError), reason="read_run looks into it unguarded")
+
+
+@pytest.mark.parametrize("text", ["{", pytest.param("[]", marks=WRONG_SHAPE), pytest.param("{}", marks=WRONG_SHAPE)])
+def test_a_damaged_description_is_refused(text: str, tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run")
+    (folder / "run.json").write_text(text)
+    with pytest.raises(InputError, match="holds no run"):
+        read_run(folder)

@@ -138,7 +138,7 @@ def test_pcils_update_costs_what_the_design_says() -> None:
 
 def test_the_parts_that_are_timed_are_the_runs_own() -> None:
     run, spec = small_run("expert"), Spec(2, 2, 1)
-    setup = bench._Setup(run, spec)
+    setup = bench.Setup(run, spec)
     floor = sorted(map(signature, products(setup.products)))
     assert floor == sorted(map(signature, update_products(run, spec)))
     before = np.asarray(setup.state.agent.actor.head.weights[0])

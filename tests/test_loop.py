@@ -170,6 +170,15 @@ def test_a_finished_run_says_so_and_trains_no_more(demos: str, tmp_path: Path) -
     assert result.final_return == np.mean([float(row[2]) for row in rows(tmp_path / "run")[0][-2:]])
 
 
+def test_a_kill_between_the_last_checkpoint_and_done_changes_nothing(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "run")
+    before = rows(tmp_path / "run"), (tmp_path / "run" / "DONE").read_text()
+    (tmp_path / "run" / "DONE").unlink()
+    finish(run, tmp_path / "run")
+    assert (rows(tmp_path / "run"), (tmp_path / "run" / "DONE").read_text()) == before
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -223,7 +232,7 @@ def test_folders_that_cannot_be_used_are_refused(demos: str, tmp_path: Path) -> 
     (tmp_path / "odd" / "run.json").write_text("[]")
     with pytest.raises(InputError, match="can't be read"):
         runs.execute(run, tmp_path / "odd", runs.Silent())
-    assert (tmp_path / "full" / "thesis.tex").read_text() == "mine"
+    assert [path.read_text() for path in (tmp_path / "full").iterdir()] == ["mine"]
 
 
 def test_two_processes_never_share_a_folder(demos: str, tmp_path: Path) -> None:

@@ -65,14 +65,14 @@ def test_info_nce_of_equal_cosines_is_the_log_of_the_number_of_candidates(cosine
     anchor, other = jnp.tile(circle(1.0), (128, 1)), jnp.tile(circle(cosine), (128, 1))
     loss, _ = info_nce(anchor, other, other, 0.07)
     assert float(loss) == pytest.approx(math.log(129), abs=1e-5)
-    assert float(loss) == pytest.approx(4.860, abs=5e-4)  # log(1 + 128), algorithms section 1.1
+    assert float(loss) == pytest.approx(4.860, abs=5e-4)  # log(1 + 128)
 
 
 def test_info_nce_at_temperature_1_cannot_fall_below_its_floor() -> None:
     anchor = jnp.tile(circle(1.0), (128, 1))
     loss, _ = info_nce(anchor, anchor, -anchor, 1.0)
     assert float(loss) == pytest.approx(math.log(1 + 128 * math.exp(-2)), abs=1e-5)
-    assert float(loss) == pytest.approx(2.908, abs=5e-4)  # log(1 + 128 e^-2), algorithms section 1.1
+    assert float(loss) == pytest.approx(2.908, abs=5e-4)  # log(1 + 128 e^-2)
 
 
 def test_info_nce_of_two_anchors_by_hand() -> None:

@@ -125,7 +125,7 @@ def test_no_two_layers_and_no_two_keys_start_alike() -> None:
 
 
 def test_the_networks_have_the_sizes_of_drq_v2() -> None:
-    """`algorithms` section 2.1: linear to the features; two hidden layers; the critic's heads see features and action."""
+    """Linear to the features; two hidden layers; the critic's heads see features and action."""
     actor, critic = make_actor(), make_critic()
     assert actor.trunk.weight.shape == critic.trunk.weight.shape == (OBS_DIM, FEATURES)
     assert [w.shape for w in actor.head.weights] == [(FEATURES, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, ACTION_DIM)]

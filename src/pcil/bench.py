@@ -30,11 +30,16 @@ KEYS = (
 )
 
 
-def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
-    """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
+def use_one_thread() -> None:
+    """Ask XLA and BLAS for one thread; it works only before JAX is imported."""
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
+
+
+def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
+    """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
+    use_one_thread()
     from pcil import envs, presets
     from pcil.envs.timing import measure_env
 
@@ -42,15 +47,15 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     env = envs.make(imitation.task)
     parts = {}
     for name, run in (("", imitation), ("agent_", alone)):
-        setup = _Setup(run, envs.spec(env))
+        setup = Setup(run, envs.spec(env))
         parts[f"{name}update_ms"] = setup.update
         parts[f"{name}floor_ms"] = setup.floor
-    setup = _Setup(imitation, envs.spec(env))
+    setup = Setup(imitation, envs.spec(env))
     parts |= {"act_us": setup.act, "sample_us": setup.sample}
-    figures = _medians(parts, seconds / 2)
+    figures = medians(parts, seconds / 2)
     timing = measure_env(imitation.task)
     figures |= {name: timing[name] for name in ("env_step_us", "physics_us")}
-    share, speed = _loop_share(imitation, seconds / 2)
+    share, speed = loop_share(imitation, seconds / 2)
     return {name: float({**figures, "loop_update_share": share, "frames_per_second": speed}[name]) for name in KEYS}
 
 
@@ -72,7 +77,7 @@ def table(figures: dict[str, float]) -> str:
     )
 
 
-class _Setup:
+class Setup:
     """One method's update on made-up data of a task's sizes, and the other parts beside it."""
 
     def __init__(self, run: Any, spec: Any) -> None:
@@ -168,7 +173,7 @@ def _products(equations: list[Any]) -> Callable[[], Any]:
     return lambda: run(lefts, rights)
 
 
-def _medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str, float]:
+def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str, float]:
     """Median time of one call of each part, in the unit that its name ends with; the parts take turns."""
     units = {name: 1e3 if name.endswith("_ms") else 1e6 for name in parts}
     times = {name: 20 if name.endswith("_ms") else 500 for name in parts}
@@ -176,7 +181,7 @@ def _medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[st
     for part in parts.values():
         part(2)
     begin = time.perf_counter()
-    while time.perf_counter() - begin < seconds or len(blocks["update_ms"]) < 3:
+    while time.perf_counter() - begin < seconds or min(map(len, blocks.values())) < 3:
         for name, part in parts.items():
             start = time.perf_counter()
             part(times[name])
@@ -184,7 +189,7 @@ def _medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[st
     return {name: statistics.median(values) for name, values in blocks.items()}
 
 
-def _loop_share(run: Any, seconds: float) -> tuple[float, float]:
+def loop_share(run: Any, seconds: float) -> tuple[float, float]:
     """Share of a real loop's time that is spent in the update, and frames a second, over whole episodes after compiling.
 
     Each update is waited for here, which the loop itself does not do, so that its time is its own.
@@ -193,7 +198,7 @@ def _loop_share(run: Any, seconds: float) -> tuple[float, float]:
 
     from pcil import learner, loop, runs
 
-    inside, marks = 0.0, []
+    inside, marks = 0.0, []  # an entry an episode: when it ended, the time spent in updates until then, its frames
     original = learner.update
 
     def timed(*arguments: Any) -> Any:
@@ -204,10 +209,12 @@ def _loop_share(run: Any, seconds: float) -> tuple[float, float]:
         return result
 
     class Watch(runs.Silent):
-        """Notes the time at the end of each episode, and stops when there are enough."""
+        """Notes the end of each episode, and stops when there are enough."""
+
+        def episode(self, run: Any, frames: int, total_reward: float) -> None:
+            marks.append((time.perf_counter(), inside, frames))
 
         def stop(self) -> bool:
-            marks.append((time.perf_counter(), inside))
             return len(marks) >= 6 and marks[-1][0] - marks[3][0] > seconds
 
     learner.update = timed
@@ -218,6 +225,5 @@ def _loop_share(run: Any, seconds: float) -> tuple[float, float]:
         pass
     finally:
         learner.update = original
-    (start, before), (end, after) = marks[3], marks[-1]
-    frames = (len(marks) - 4) * 1000
-    return (after - before) / (end - start), frames / (end - start)
+    (start, before, first), (end, after, last) = marks[3], marks[-1]
+    return (after - before) / (end - start), (last - first) / (end - start)

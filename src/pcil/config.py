@@ -56,7 +56,7 @@ class Run:
     update_every: int = 2
     """Agent steps for each update."""
     replay_steps: int = 500_000
-    """Agent steps that the replay holds."""
+    """Rows of the replay: a row for each agent step, and one more for each episode."""
     evaluate_every: int = 20_000
     """Frames from one evaluation to the next."""
     evaluate_episodes: int = 10

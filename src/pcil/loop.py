@@ -46,6 +46,8 @@ class Counters:
     evaluations: int = 0
     seconds: float = 0.0
     """Wall-clock time until now, over all sessions."""
+    final_return: float | None = None
+    """Mean return of the last evaluation, once there is nothing left to do."""
 
 
 @dataclass
@@ -63,10 +65,10 @@ class Stopped(Exception):
     """The run was asked to stop, and has saved itself."""
 
 
-def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> tuple[State, Evaluation]:
+def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> State:
     """Train until `run.frames`, resuming from the folder's newest whole checkpoint; each pass of the loop is one episode.
 
-    Returns the final state and the final evaluation. Raises `Stopped` where the reporter asks for it.
+    Returns the final state, with the final return in its counters. Raises `Stopped` where the reporter asks for it.
     """
     env = envs.make(run.task)
     spec = envs.spec(env)
@@ -88,14 +90,16 @@ def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> tupl
 
             stop = reporter.stop()
             if stop or clock.total() - saved >= run.checkpoint_seconds:
-                _save(folder, state, log, clock, replay=True)
+                _save(folder, state, log, clock)
                 saved = clock.total()
             if stop:
                 raise Stopped
 
-        result = _evaluate(run, folder, state, rollout, log, clock, reporter)
-        _save(folder, state, log, clock, replay=False)
-    return state, result
+        if state.counters.final_return is None:
+            result = _evaluate(run, folder, state, rollout, log, clock, reporter)
+            state.counters = replace(state.counters, final_return=result.mean)
+            _save(folder, state, log, clock)
+    return state
 
 
 def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State, demos: Batch) -> Episode:
@@ -206,11 +210,11 @@ def _start(run: Run, spec: Spec, demos: Batch) -> State:
     return State(fresh, jax.tree.map(jnp.copy, run.agent.actor(fresh.agent)), replay, Counters())
 
 
-def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock, *, replay: bool) -> None:
+def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
     """Everything that the rest of the run depends on; a finished run needs no replay."""
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
-    if replay:
+    if counters.final_return is None:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
     meta = {"counters": asdict(counters), "positions": log.positions()}
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
@@ -224,9 +228,10 @@ def _resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[S
     if arrays is None:
         return fresh, {}
     restored = checkpoint.unflatten("learner", fresh.learner, arrays)
-    fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
     counters = Counters(**meta["counters"])
-    reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
+    if counters.final_return is None:
+        fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
+        reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
     actor = jax.tree.map(jnp.copy, run.agent.actor(restored.agent))
     return State(restored, actor, fresh.replay, counters), meta["positions"]
 

@@ -27,7 +27,7 @@ class MetricWriter:
         self._files = {name: self._open(folder / name, positions.get(name, 0)) for name in ("eval.csv", "train.jsonl")}
         if not self._files["eval.csv"].tell():
             self._write("eval.csv", ",".join(EVAL_COLUMNS) + "\n")
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=frames or None)
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=frames + 1 if frames else None)
 
     def positions(self) -> dict[str, int]:
         """Length of each file in bytes, for the checkpoint."""

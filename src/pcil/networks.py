@@ -52,7 +52,7 @@ class MLP(eqx.Module):
 
 
 class Trunk(eqx.Module):
-    """Linear, layer normalisation, tanh: observations to features in (-1, 1) (DrQ-v2 on states; `algorithms` section 2.1)."""
+    """Linear, layer normalisation, tanh: observations to features in (-1, 1) (authors' code: agent/drqv2.py)."""
 
     weight: Float[Any, "obs features"]
     bias: Float[Any, " features"]

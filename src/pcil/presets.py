@@ -48,6 +48,7 @@ def released(task: str) -> dict[str, Any]:
         **settings,
         "frames": 2_100_000,  # authors' cfgs/suite/dmc.yaml
         "random_frames": 24_000,  # authors' cfgs/suite/dmc.yaml: 12000 agent steps for PCIL and DAC
+        "reward.batch_size": 256 if task.startswith("walker") else 128,  # authors' batch_size // bz_ratio
         "agent": dataclasses.replace(
             settings["agent"],
             batch_size=512 if task.startswith("walker") else 256,  # authors' cfgs/config.yaml, DrQ-v2 cfgs/task
@@ -99,10 +100,14 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     """
     _known("method", method, REWARDS)
     _known("preset", preset, PRESETS)
-    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": REWARD_SETTINGS[method, preset]}
-    plain = {name: value for name, value in changes.items() if name in settings}
-    run = Run(task=task, method=method, preset=preset, **{**settings, **plain})
-    return changed(run, {name: value for name, value in changes.items() if name not in settings})
+    reward = changes.get("reward", REWARD_SETTINGS[method, preset])
+    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": reward, **changes}
+    if not reward.needs_demos:
+        settings.pop("reward.batch_size", None)
+    nested = {name: settings.pop(name) for name in list(settings) if "." in name}
+    unknown = [name for name in settings if name not in {field.name for field in dataclasses.fields(Run)}]
+    nested |= {name: settings.pop(name) for name in unknown}  # refused by `changed`, which says what there is
+    return changed(Run(task=task, method=method, preset=preset, **settings), nested)
 
 
 def _known(kind: str, name: str, names: Any) -> None:

@@ -84,8 +84,8 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
             with _full_disk_is_input_error(folder):
-                _, final = loop.train_loop(run, folder, _batch(demos, run), reporter)
-                _write(folder / "DONE", json.dumps({"final_return": final.mean}) + "\n")
+                final = loop.train_loop(run, folder, _batch(demos, run), reporter).counters.final_return
+                _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
 
 
@@ -114,6 +114,9 @@ def _claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for this process alone."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        strangers = sorted(path.name for path in folder.iterdir() if path.name != ".lock" and path.suffix != ".tmp")
+        if strangers and "run.json" not in strangers:
+            raise InputError(f"The folder {folder} holds something else ({strangers[0]}); give --out a new or empty folder.")
         lock = (folder / ".lock").open("w")
     except OSError as error:
         raise InputError(f"The folder {folder} can't be written ({error.strerror}); give --out another one.") from error
@@ -136,9 +139,6 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
     about = json.loads(json.dumps(about))
     path = folder / "run.json"
     if not path.exists():
-        strangers = sorted(p.name for p in folder.iterdir() if p.name != ".lock" and p.suffix != ".tmp")
-        if strangers:
-            raise InputError(f"The folder {folder} holds something else ({strangers[0]}); give --out a new or empty folder.")
         _write(path, json.dumps(about, indent=2) + "\n")
         return
     try:

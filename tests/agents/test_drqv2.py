@@ -97,8 +97,7 @@ def trained_on(task: str, folder: Path, frames: int = 1200) -> loop.State:
     run = small_run("expert", task, frames=frames, random_frames=frames, evaluate_every=frames, agent=agent, update_every=1)
     folder.mkdir()
     empty = Batch(np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
-    state, _ = loop.train_loop(run, folder, empty, runs.Silent())
-    return state
+    return loop.train_loop(run, folder, empty, runs.Silent())
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5])

@@ -140,7 +140,7 @@ def test_no_anchor_is_its_own_positive() -> None:
 
 
 def test_nothing_flows_into_the_agents_features() -> None:
-    """Encoder updates stop at the features (Section 1.3 of the authors' code): the loop's embed blocks the gradient."""
+    """Encoder updates stop at the features, as in the authors' agent/pcil.py: the loop's embed blocks the gradient."""
     run = small_run()
     agent = run.agent.init(Spec(6, 1, 1), key=jax.random.key(0))
     batch = random_batch(32, 6, 1)

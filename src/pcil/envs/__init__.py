@@ -26,7 +26,7 @@ TASKS = (
     "quadruped_run",
     "walker_run",
 )
-"""The ten tasks of the paper's Table 1, all from DeepMind Control."""
+"""The ten tasks of the paper (Appendix A), all from DeepMind Control."""
 
 _TOYS = {
     "toy/point_mass-v0": "PointMass",

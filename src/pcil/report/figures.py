@@ -72,8 +72,7 @@ def _panel(axis: Axes, task: str, points: Sequence[Point]) -> None:
         colour = COLOURS.get(method, INK) if alone else plt.get_cmap("tab10")(index)
         mine = [point for point in points if (point.method, point.variant) == (method, variant)]
         _seeds(axis, mine, colour, method if alone else f"{method}, {variant}")
-    experts = {point.expert_return for point in points} - {None}
-    for expert in experts:
+    for expert in {point.expert_return for point in points if point.expert_return is not None}:
         axis.axhline(expert, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert:.0f}")
     _finish(axis, task)
 

@@ -6,7 +6,7 @@ import csv
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,12 +40,13 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{folder} holds no run that can be read ({error}); give folders that pcil train made.") from error
     run, expert = about["run"], (about["demos"] or {}).get("return_mean")
-    head = run["task"], run["method"], variant or run["preset"], run["seed"]
+    head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
+    tail = {"expert_return": expert and round(expert, 2), "commit": about["commit"] or ""}
     points = []
     for frames in dict.fromkeys(frame for frame, _ in rows):
         values = np.array([value for frame, value in rows if frame == frames])
-        measured = (round(float(value), 2) for value in (values.mean(), values.min(), values.max()))
-        points.append(Point(*head, frames, *measured, expert and round(expert, 2), about["commit"] or ""))
+        mean, low, high = (round(float(value), 2) for value in (values.mean(), values.min(), values.max()))
+        points.append(Point(**head, frames=frames, return_mean=mean, return_low=low, return_high=high, **tail))
     return points
 
 
@@ -60,15 +61,10 @@ def write_points(path: Path, points: Iterable[Point]) -> None:
 
 def read_points(path: Path) -> list[Point]:
     """What `write_points` wrote."""
+    kinds = {"seed": int, "frames": int, "return_mean": float, "return_low": float, "return_high": float}
     with path.open() as file:
-        return [
-            Point(
-                *(row[name] for name in Point._fields[:3]),
-                int(row["seed"]),
-                int(row["frames"]),
-                *(float(row[name]) for name in Point._fields[5:8]),
-                float(row["expert_return"]) if row["expert_return"] else None,
-                row["commit"],
-            )
-            for row in csv.DictReader(file)
-        ]
+        rows: list[dict[str, Any]] = list(csv.DictReader(file))
+    for row in rows:
+        row |= {name: kind(row[name]) for name, kind in kinds.items()}
+        row["expert_return"] = float(row["expert_return"]) if row["expert_return"] else None
+    return [Point(**row) for row in rows]

@@ -37,7 +37,10 @@ class Reward(abc.ABC):
 
     @abc.abstractmethod
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> Any:
-        """The state before the first update; `demos` are all expert states and actions in the order of time."""
+        """The state before the first update; `demos` are all expert states and actions in the order of time.
+
+        It is compiled, so it computes with JAX.
+        """
 
     @abc.abstractmethod
     def update(self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:

@@ -171,7 +171,6 @@ def test_a_folder_with_another_run_is_refused(run: Path, demos: str, capsys: pyt
     assert "seed was 1, now 2" in said and "agent.gamma was 0.99, now 0.9" in said
 
 
-@pytest.mark.xfail(strict=True, reason="runs._claimed leaves .lock in a folder that turns out to be someone else's")
 def test_a_folder_with_something_else_is_refused(demos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("mine")

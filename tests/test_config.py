@@ -173,3 +173,26 @@ def test_numbers_out_of_range_are_refused(name: str, bad: int, good: int) -> Non
         presets.make("walker_walk", **{name: bad})
     sentence = str(refusal.value)
     assert sentence.endswith(".") and "\n" not in sentence and not math.isnan(good)
+
+
+WHOLE = ("agent.hidden", "agent.n_step", "agent.feature_dim", "agent.batch_size", "reward.hidden", "reward.batch_size")
+REAL = ("agent.gamma", "agent.learning_rate", "agent.tau", "reward.temperature", "reward.penalty")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [(name, value) for name in (*WHOLE, "evaluate_every", "update_every") for value in (0, -1)]
+    + [(name, value) for name in REAL for value in (math.nan, -0.5)],
+)
+def test_settings_that_cannot_work_are_refused_when_they_are_made(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=rf"\w+.{name.split('.')[-1]} is {value}; it must be"):
+        presets.make("walker_walk", **{name: value})
+
+
+def test_nested_settings_are_reached_by_dotted_names() -> None:
+    run = presets.make("walker_walk", **{"agent.noise.steps": 7, "agent.gamma": 0.5, "seed": 3})
+    assert (run.agent.noise.steps, run.agent.gamma, run.seed) == (7, 0.5, 3)
+    with pytest.raises(InputError, match=r"DrQV2 has no setting 'gama'; it has batch_size, "):
+        presets.make("walker_walk", **{"agent.gama": 0.5})
+    with pytest.raises(InputError, match="Run has no setting 'fames'"):
+        presets.make("walker_walk", fames=5)

@@ -27,7 +27,8 @@ from minari.dataset.minari_storage import MinariStorage
 
 from pcil import demos, seeds
 from pcil.demos import Demonstrations
-from pcil.types import Episode, InputError, Spec
+from pcil.errors import InputError
+from pcil.types import Episode, Spec
 
 
 def make_episode(steps: int = 5, obs_dim: int = 3, action_dim: int = 2, seed: int = 0, **changes) -> Episode:

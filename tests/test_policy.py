@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from pcil.errors import InputError
 from pcil.networks import Actor
 from pcil.policy import Policy, load_policy
-from pcil.types import InputError, Spec
+from pcil.types import Spec
 
 OBS_DIM, ACTION_DIM = 5, 3
 INFO = {"method": "pcil", "frames": 2000, "seed": 1, "action_repeat": 2, "return_mean": 1 / 3}

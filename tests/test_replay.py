@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chisquare
 
+from pcil.errors import InputError
 from pcil.replay import Replay
-from pcil.types import Episode, InputError, Window
+from pcil.types import Episode, Window
 
 law = settings(deadline=None, derandomize=True, max_examples=60)
 

@@ -24,7 +24,7 @@ LONGEST = 350
 LAYERS = [
     "errors types seeds compilation",
     "losses optimiser networks noise",
-    "envs demos replay policy rewards agents",
+    "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
     "bench doctor arguments cli",
 ]

@@ -18,7 +18,7 @@ __all__ = ["Demonstrations", "Episode", "InputError", "Policy", "Reward", "load_
 _HOME = {
     "Demonstrations": ("pcil.demos", "Demonstrations"),
     "Episode": ("pcil.types", "Episode"),
-    "InputError": ("pcil.types", "InputError"),
+    "InputError": ("pcil.errors", "InputError"),
     "Policy": ("pcil.policy", "Policy"),
     "Reward": ("pcil.rewards", "Reward"),
     "load_policy": ("pcil.policy", "load_policy"),

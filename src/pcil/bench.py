@@ -43,6 +43,7 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     from pcil import envs, presets
     from pcil.envs.timing import measure_env
 
+    timing = measure_env(task)
     imitation, alone = (presets.make(task, method, preset) for method in ("pcil", "expert"))
     env = envs.make(imitation.task)
     parts = {}
@@ -53,7 +54,6 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     setup = Setup(imitation, envs.spec(env))
     parts |= {"act_us": setup.act, "sample_us": setup.sample}
     figures = medians(parts, seconds / 2)
-    timing = measure_env(imitation.task)
     figures |= {name: timing[name] for name in ("env_step_us", "physics_us")}
     share, speed = loop_share(imitation, seconds / 2)
     return {name: float({**figures, "loop_update_share": share, "frames_per_second": speed}[name]) for name in KEYS}

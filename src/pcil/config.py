@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from math import inf
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from pcil.agents import Agent, DrQV2
+from pcil.errors import InputError, check_ranges
 from pcil.rewards import PCIL, Reward
-from pcil.types import InputError
 
 MACHINE_SETTINGS = ("checkpoint_seconds",)
 """Settings that change no result, so a run may resume with others."""
@@ -29,7 +30,7 @@ class Method:
 class Run:
     """Every setting of a run. Frames are environment control steps: agent steps times the action repeat."""
 
-    task: tyro.conf.Positional[str]
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     """One of the ten tasks (walker_walk), another dm_control suite task, or any Gymnasium id."""
     method: str = "pcil"
     """Name of the method; it chooses the reward and its settings."""
@@ -80,10 +81,8 @@ class Run:
                 f"{self.agent.batch_size}; make reward.batch_size at most agent.batch_size."
             )
         for name in ("update_every", "evaluate_every", "evaluate_episodes", "replay_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1.")
-        if not 0 <= self.seed < 2**31:
-            raise InputError(f"The seed is {self.seed}; it must be from 0 to 2147483647.")
+            check_ranges(self, **{name: (1, inf)})
+        check_ranges(self, seed=(0, 2**31 - 1), seed_frames=(0, inf), random_frames=(0, inf), checkpoint_seconds=(0, inf))
 
     @property
     def learner(self) -> Method:

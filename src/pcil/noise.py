@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
+
+from pcil.errors import check_ranges
 
 ACTION_MARGIN = 1e-6
 """Sampled actions stay this far inside (-1, 1) (authors' code: utils.py, `TruncatedNormal`)."""
@@ -21,6 +24,9 @@ class LinearSchedule:
     start: float = 1.0
     end: float = 0.1
     steps: int = 500_000
+
+    def __post_init__(self) -> None:
+        check_ranges(self, start=(0, inf), end=(0, inf), steps=(0, inf))
 
     def __call__(self, step: Any, xp: ModuleType = jnp) -> Float[Any, ""]:
         mix = xp.minimum(xp.float32(step) / xp.float32(max(self.steps, 1)), 1.0)

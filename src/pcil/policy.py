@@ -11,8 +11,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from pcil.errors import InputError
 from pcil.networks import MLP, Actor, Trunk
-from pcil.types import InputError, Spec
+from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"
 

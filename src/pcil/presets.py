@@ -12,9 +12,9 @@ from typing import Any
 
 from pcil.agents import DrQV2
 from pcil.config import Run, changed
+from pcil.errors import InputError
 from pcil.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, REWARDS, Reward, TaskReward
-from pcil.types import InputError
 
 
 def paper(task: str) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pcil.types import Episode, InputError, Window
+from pcil.errors import InputError
+from pcil.types import Episode, Window
 
 
 class Segment(NamedTuple):

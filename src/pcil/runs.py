@@ -19,9 +19,10 @@ import numpy as np
 from pcil import compilation, envs, loop, presets
 from pcil.config import Run, differences
 from pcil.demos import Demonstrations
+from pcil.errors import InputError
 from pcil.evaluate import Evaluation
 from pcil.policy import Policy, load_policy
-from pcil.types import Batch, InputError
+from pcil.types import Batch
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
@@ -99,7 +100,9 @@ def demonstrations(run: Run) -> Demonstrations | None:
     environment = envs.make(run.task)
     if not run.reward.needs_demos:
         return None
-    return Demonstrations.load(run.demos or run.task).take(run.num_demos).validate(envs.spec(environment))
+    return (
+        Demonstrations.load(run.task if run.demos is None else run.demos).take(run.num_demos).validate(envs.spec(environment))
+    )
 
 
 def _batch(demos: Demonstrations | None, run: Run) -> Batch:
@@ -174,15 +177,17 @@ def provenance(folder: Path, policy: Policy, command: str) -> dict[str, Any]:
     """Where demonstrations recorded from a policy come from; the settings are those of its run, where they are known."""
     frames, seed = policy.info.get("frames"), policy.info.get("seed")
     path = folder / "run.json"
-    trained = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        trained = json.loads(path.read_text()) if path.exists() else {}
+        known = {name: trained.get(name) for name in ("commit", "run", "versions")}
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} can't be read ({error}), so nobody could say where the demonstrations are from.") from error
     return {
         "expert": f"{policy.info.get('method', 'policy')}, {frames} frames, seed {seed}",
         "command": command,
         "frames": frames,
         "seed": seed,
-        "commit": trained.get("commit"),
-        "run": trained.get("run"),
-        "versions": trained.get("versions"),
+        **known,
     }
 
 

@@ -15,7 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from pcil.envs import TASKS, make
 from pcil.envs.dmc import DMCEnv, import_suite, split_name
 from pcil.envs.views import views_for
-from pcil.types import InputError
+from pcil.errors import InputError
 
 suite = import_suite()
 

@@ -13,7 +13,8 @@ from gymnasium import spaces
 from pcil import envs
 from pcil.envs import TASKS, make, register, spec, task_name
 from pcil.envs.timing import measure_env
-from pcil.types import InputError, Spec
+from pcil.errors import InputError
+from pcil.types import Spec
 
 SPECS = {
     "finger_spin": Spec(9, 2, 2),

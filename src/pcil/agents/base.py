@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pcil.errors import check_ranges
 from pcil.networks import Actor
 from pcil.types import Spec, Window
 
@@ -23,6 +25,9 @@ class Agent(abc.ABC):
     """Windows in one update."""
     n_step: int = 3
     """Steps of reward before the target bootstraps: the length of a window."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, batch_size=(1, inf), n_step=(1, inf))
 
     @abc.abstractmethod
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> Any:

@@ -6,6 +6,7 @@ Facts and sources: the authors' drqv2.py; `docs/methods/drqv2.md` lists where we
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import inf
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Metrics
+from pcil.errors import check_ranges
 from pcil.losses import n_step_target
 from pcil.networks import Actor, Critic
 from pcil.noise import LinearSchedule, perturb
@@ -49,6 +51,11 @@ class DrQV2(Agent):
     """Standard deviation of the exploration noise over agent steps."""
     noise_clip: float = 0.3
     """Bound on the noise of the actions inside the updates; acting has no bound."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf))
+        check_ranges(self, feature_dim=(1, inf), hidden=(1, inf))
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> DrQV2State:
         actor_key, critic_key = jax.random.split(key)

@@ -10,7 +10,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces, wrappers
 
-from pcil.types import InputError, Spec
+from pcil.errors import InputError
+from pcil.types import Spec
 
 __all__ = ["TASKS", "make", "register", "spec", "task_name"]
 

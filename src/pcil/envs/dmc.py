@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 
 from pcil.envs.views import Views, views_for
-from pcil.types import InputError
+from pcil.errors import InputError
 
 _RENDERERS = {
     "egl": ("dm_control._render.pyopengl.egl_renderer", "EGLContext"),

@@ -12,7 +12,7 @@ import numpy as np
 
 from pcil.envs import make, spec
 from pcil.envs.dmc import DMCEnv
-from pcil.types import InputError
+from pcil.errors import InputError
 
 _BLOCK = 50
 """Agent steps timed at once: env and physics take turns, so that both see the same disturbances."""

@@ -37,11 +37,11 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
         about = json.loads((folder / "run.json").read_text())
         with (folder / "eval.csv").open() as file:
             rows = [(int(row["frames"]), float(row["return"])) for row in csv.DictReader(file)]
-    except (OSError, ValueError, KeyError) as error:
+        run, expert = about["run"], (about["demos"] or {}).get("return_mean")
+        head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
+        tail = {"expert_return": expert and round(expert, 2), "commit": about["commit"] or ""}
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{folder} holds no run that can be read ({error}); give folders that pcil train made.") from error
-    run, expert = about["run"], (about["demos"] or {}).get("return_mean")
-    head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
-    tail = {"expert_return": expert and round(expert, 2), "commit": about["commit"] or ""}
     points = []
     for frames in dict.fromkeys(frame for frame, _ in rows):
         values = np.array([value for frame, value in rows if frame == frames])

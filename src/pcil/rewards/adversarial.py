@@ -6,12 +6,14 @@ Kostrikov et al. 2019 in the form of the authors' code (agent/dac.py): the featu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pcil.errors import check_ranges
 from pcil.losses import binary_cross_entropy, gradient_penalty, interpolate
 from pcil.networks import MLP
 from pcil.optimiser import Moments, adam_init, adam_step
@@ -36,6 +38,10 @@ class DAC(Reward):
     """Width of the two hidden layers."""
     learning_rate: float = 1e-4
     """Adam's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, batch_size=(1, inf), penalty=(0, inf), hidden=(1, inf), learning_rate=(0, 1))
 
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
         features = jax.eval_shape(embed, jnp.asarray(demos.obs)).shape[-1]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from typing import Any, ClassVar, Literal
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pcil.errors import check_ranges
 from pcil.types import Batch
 
 Metrics = dict[str, Float[Array, ""]]
@@ -34,6 +36,9 @@ class Reward(abc.ABC):
     """Weight of the environment's own reward, which is added to the learned one."""
     batch_size: int = 128
     """Expert steps in one update, and as many of the agent."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf))
 
     @abc.abstractmethod
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> Any:

@@ -7,6 +7,7 @@ authors' code.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pcil.errors import check_ranges
 from pcil.losses import gradient_penalty, info_nce, interpolate
 from pcil.networks import MLP, unit_sphere
 from pcil.optimiser import Moments, adam_init, adam_step
@@ -58,6 +60,12 @@ class PCIL(Reward):
     """Width of the three hidden layers; the embedding has a quarter of it."""
     learning_rate: float = 1e-4
     """Adam's."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(
+            self, temperature=(1e-6, inf), penalty=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf)
+        )
 
     def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> PCILState:
         encoder_key, reference_key = jax.random.split(key)

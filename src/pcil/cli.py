@@ -193,8 +193,7 @@ def _demos(words: list[str]) -> int:
         if json_output:
             print(json.dumps(rows))
             return 0
-        sizes, returns = ["observation_dim", "action_dim", "episodes"], ["return_mean", "return_std"]
-        _print_table(["task", *sizes, *returns, "expert", "frames", "seeds_tried"], rows)
+        print("\n".join(_demos_table(rows)))
         return 0
 
     return arguments.call("demos", demos, words)
@@ -283,15 +282,14 @@ def _at_least(least: int, **options: int) -> None:
             raise InputError(f"--{name} is {value}; it must be at least {least}.")
 
 
-def _print_table(columns: list[str], rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(*columns)
+def _demos_table(rows: list[dict[str, Any]]) -> list[str]:
+    """One line a dataset, within 80 columns."""
+    lines = [f"{'task':<18}{'obs':>4}{'act':>4}{'episodes':>9}{'return':>15}{'frames':>11}{'seeds tried':>12}"]
     for row in rows:
-        table.add_row(*(Text(f"{row[c]:.1f}" if isinstance(row[c], float) else str(row[c])) for c in columns))
-    Console().print(table)
+        returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
+        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}"
+        lines.append(f"{row['task']:<18}{sizes}{returns:>15}{row['frames'] or 0:>11,}{row['seeds_tried'] or 0:>12}")
+    return lines
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

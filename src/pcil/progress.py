@@ -44,14 +44,14 @@ class Bar:
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
-            TextColumn("{task.completed:,.0f}/{task.total:,.0f} frames  {task.fields[speed]}"),
+            TextColumn("{task.fields[amount]}"),
             TimeElapsedColumn(),
             _TimeLeft(),
             TextColumn("{task.fields[returns]}"),
             console=console,
             disable=not console.is_terminal,
         )
-        self._task = self._progress.add_task("starting", total=None, speed="", returns="", rate=0.0)
+        self._task = self._progress.add_task("starting", total=None, amount="", returns="", rate=0.0)
 
     def __enter__(self) -> Bar:
         self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -69,7 +69,8 @@ class Bar:
         self._began = self._began or (now, frames)
         seconds = now - self._began[0]
         rate = (frames - self._began[1]) / seconds if seconds > 0 else 0.0
-        self._update(run, frames, rate=rate, speed=f"{rate:,.0f}/s", returns=self._returns(total_reward))
+        amount = f"{frames:,}/{run.frames:,} frames  {rate:,.0f}/s"
+        self._update(run, frames, rate=rate, amount=amount, returns=self._returns(total_reward))
 
     def evaluation(self, run: Run, frames: int, result: Evaluation) -> None:
         """One line for each evaluation, beside the expert's return."""

@@ -1,0 +1,43 @@
+"""What a person sees on a terminal."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from rich.console import Console
+
+from pcil.evaluate import Evaluation
+from pcil.progress import Bar, compared
+from small import small_run
+
+
+def shown(expert: float | None) -> str:
+    """Everything that a terminal of 140 columns gets from one evaluation and two episodes."""
+    stream = io.StringIO()
+    run = small_run("expert", frames=100_000)
+    with Bar(Console(file=stream, force_terminal=True, width=140, color_system=None), expert) as bar:
+        bar.evaluation(run, 0, Evaluation(np.array([1.0, 3.0]), np.array([5, 5]), 0.1))
+        bar.episode(run, 1000, 12.0)
+        bar.episode(run, 2000, 34.0)
+        assert not bar.stop()
+    return stream.getvalue()
+
+
+def test_the_bar_says_frames_speed_time_left_and_return_beside_the_experts() -> None:
+    text = shown(40.0)
+    last = [line for line in text.splitlines() if "2,000/100,000 frames" in line][-1]
+    assert "/s" in last and "left" in last and "return 34 of 40" in last
+    assert "0 frames  return     2.0  [1.0, 3.0] (5% of the expert's 40.0)" in text
+
+
+def test_without_an_expert_nothing_is_compared() -> None:
+    text = shown(None)
+    assert "return 34" in text and "expert's" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "expert", "said"), [(9.0, 10.0, "90% of the expert's 10.0"), (-9.0, -10.0, "the expert's -10.0")]
+)
+def test_a_share_is_said_only_of_positive_returns(value: float, expert: float, said: str) -> None:
+    assert compared(value, expert) == said

@@ -4,6 +4,7 @@ import os
 
 os.environ.setdefault("MUJOCO_GL", "disabled")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads only wait for each other; XLA has threads of its own
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # a worker a core
 
 from jaxtyping import install_import_hook
 

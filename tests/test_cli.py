@@ -363,12 +363,20 @@ def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) 
 def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """What a dataset says of itself is shown as it is: brackets are no markup."""
     monkeypatch.setenv("COLUMNS", "300")
-    row = {"task": "mine", "observation_dim": 2, "action_dim": 2, "episodes": 3, "return_mean": 41.26, "return_std": 0.5}
-    shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None}
+    row = {
+        "task": "mine",
+        "observation_dim": 2,
+        "action_dim": 2,
+        "episodes": 3,
+        "return_mean": 41.26,
+        "return_std": 0.5,
+        "steps": 9,
+    }
+    shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None, "hash": "0123456789abcdef"}
     monkeypatch.setattr("pcil.demos.shipped", lambda: [shown])
     assert cli.main(["demos"]) == 0
     out = capsys.readouterr().out
-    assert "me [/bold] [red]" in out and "41.3" in out
+    assert "me [/bold] [red]" in out and "41.3" in out and "01234567 " in out
 
 
 # --- Stopping ---

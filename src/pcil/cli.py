@@ -283,12 +283,14 @@ def _at_least(least: int, **options: int) -> None:
 
 
 def _demos_table(rows: list[dict[str, Any]]) -> list[str]:
-    """One line a dataset, within 80 columns."""
-    lines = [f"{'task':<18}{'obs':>4}{'act':>4}{'episodes':>9}{'return':>15}{'frames':>11}{'seeds tried':>12}"]
+    """One line a dataset, for people."""
+    sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
+    lines = [f"{'task':<18}{sizes}{'return':>15}{'tries':>6}  {'hash':<10}expert"]
     for row in rows:
+        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}{row['steps']:>7}"
         returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
-        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}"
-        lines.append(f"{row['task']:<18}{sizes}{returns:>15}{row['frames'] or 0:>11,}{row['seeds_tried'] or 0:>12}")
+        tries = "" if row["seeds_tried"] is None else row["seeds_tried"]
+        lines.append(f"{row['task']:<18}{sizes}{returns:>15}{tries:>6}  {row['hash'][:8]:<10}{row['expert']}")
     return lines
 
 

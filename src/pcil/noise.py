@@ -29,7 +29,7 @@ class LinearSchedule:
         check_ranges(self, start=(0, inf), end=(0, inf), steps=(0, inf))
 
     def __call__(self, step: Any, xp: ModuleType = jnp) -> Float[Any, ""]:
-        mix = xp.minimum(xp.float32(step) / xp.float32(max(self.steps, 1)), 1.0)
+        mix = xp.minimum(xp.maximum(xp.float32(step) / xp.float32(max(self.steps, 1)), 0.0), 1.0)
         return xp.float32(self.start) * (1 - mix) + xp.float32(self.end) * mix
 
 

@@ -228,3 +228,9 @@ def test_the_python_in_the_docs_is_python() -> None:
             tree = ast.parse(text)
             used = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and getattr(n.value, "id", "") == "pcil"}
             assert used <= set(pcil.__all__), page.name
+
+
+def test_the_tables_of_results_are_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Filled from results/*.csv and what ships, by the command that the page names."""
+    monkeypatch.syspath_prepend(ROOT / "experiments")
+    assert importlib.import_module("results").main(["--check"]) == 0, "run python experiments/results.py"

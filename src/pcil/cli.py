@@ -64,6 +64,8 @@ def _train(words: list[str]) -> int:
         changes["reward"] = _load_reward(given["reward"])
         words = arguments.without(words, "reward")
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
+    if "reward" in given and "method" not in given:
+        default = dataclasses.replace(default, method=given["reward"])  # its results go by its own name
     if "task" not in given and not {"-h", "--help"} & set(words):
         raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
 

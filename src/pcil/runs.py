@@ -81,12 +81,11 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
     compilation.use_cache()
     demos = demonstrations(run)
-    with _claimed(folder):
+    with _claimed(folder), _full_disk_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
-            with _full_disk_is_input_error(folder):
-                final = loop.train_loop(run, folder, _batch(demos, run), reporter).counters.final_return
-                _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
+            final = loop.train_loop(run, folder, _batch(demos, run), reporter).counters.final_return
+            _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
 
 
@@ -100,9 +99,8 @@ def demonstrations(run: Run) -> Demonstrations | None:
     environment = envs.make(run.task)
     if not run.reward.needs_demos:
         return None
-    return (
-        Demonstrations.load(run.task if run.demos is None else run.demos).take(run.num_demos).validate(envs.spec(environment))
-    )
+    source = run.task if run.demos is None else run.demos
+    return Demonstrations.load(source).take(run.num_demos).validate(envs.spec(environment))
 
 
 def _batch(demos: Demonstrations | None, run: Run) -> Batch:
@@ -207,6 +205,6 @@ def _full_disk_is_input_error(folder: Path) -> Iterator[None]:
         if not full:
             raise
         raise InputError(
-            f"The disk is full, so the run in {folder} stopped; its last checkpoint is whole: free some space and give the "
-            "same command again."
+            f"The disk is full, so the run in {folder} stopped; what it saved is whole: free some space and give the same "
+            "command again."
         ) from error

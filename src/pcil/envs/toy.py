@@ -7,6 +7,7 @@ observations.
 
 from __future__ import annotations
 
+import abc
 from typing import Any
 
 import gymnasium
@@ -48,7 +49,7 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
         return np.clip(-np.asarray(obs) / cls.SPEED, -1.0, 1.0)
 
 
-class Probe(gymnasium.Env[np.ndarray, np.ndarray]):
+class Probe(gymnasium.Env[np.ndarray, np.ndarray], abc.ABC):
     """One number observed, one number acted; terminates after one step unless the probe says otherwise."""
 
     def __init__(self) -> None:
@@ -69,9 +70,9 @@ class Probe(gymnasium.Env[np.ndarray, np.ndarray]):
         self._obs = np.array([0.0 if next_obs is None else next_obs], np.float32)
         return self._obs, reward, next_obs is None, False, {}
 
+    @abc.abstractmethod
     def value(self, obs: float, discount: float) -> float:
         """The return of the best policy from `obs` on."""
-        raise NotImplementedError
 
     def _first_obs(self) -> float:
         return 0.0
@@ -81,8 +82,9 @@ class Probe(gymnasium.Env[np.ndarray, np.ndarray]):
         del obs
         return None
 
+    @abc.abstractmethod
     def _pay(self, obs: float, action: float) -> float:
-        raise NotImplementedError
+        """The reward of an action in an observation."""
 
     def _random_sign(self) -> float:
         return float(self.np_random.choice([-1.0, 1.0]))

@@ -80,8 +80,7 @@ class Run:
                 f"The reward's batch of {self.reward.batch_size} agent steps is taken from the agent's batch, which has "
                 f"{self.agent.batch_size}; make reward.batch_size at most agent.batch_size."
             )
-        for name in ("update_every", "evaluate_every", "evaluate_episodes", "replay_steps"):
-            check_ranges(self, **{name: (1, inf)})
+        check_ranges(self, update_every=(1, inf), evaluate_every=(1, inf), evaluate_episodes=(1, inf), replay_steps=(1, inf))
         check_ranges(self, seed=(0, 2**31 - 1), seed_frames=(0, inf), random_frames=(0, inf), checkpoint_seconds=(0, inf))
 
     @property

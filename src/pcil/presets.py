@@ -100,14 +100,12 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     """
     _known("method", method, REWARDS)
     _known("preset", preset, PRESETS)
-    reward = changes.get("reward", REWARD_SETTINGS[method, preset])
-    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": reward, **changes}
-    if not reward.needs_demos:
-        settings.pop("reward.batch_size", None)
+    settings: dict[str, Any] = {**PRESETS[preset](task), "reward": REWARD_SETTINGS[method, preset]}
     nested = {name: settings.pop(name) for name in list(settings) if "." in name}
-    unknown = [name for name in settings if name not in {field.name for field in dataclasses.fields(Run)}]
-    nested |= {name: settings.pop(name) for name in unknown}  # refused by `changed`, which says what there is
-    return changed(Run(task=task, method=method, preset=preset, **settings), nested)
+    run = Run(task=task, method=method, preset=preset, **settings)
+    if not changes.get("reward", run.reward).needs_demos:
+        nested.pop("reward.batch_size", None)
+    return changed(run, nested | changes)
 
 
 def _known(kind: str, name: str, names: Any) -> None:

@@ -36,7 +36,6 @@ class Bar:
     """Reports a run to the terminal. Ctrl-C or SIGTERM ends it after the episode at hand; a second Ctrl-C at once."""
 
     def __init__(self, console: Console, expert_return: float | None) -> None:
-        self.console = console
         self.signal: int | None = None
         self.evaluations: list[tuple[int, float]] = []
         self._expert = expert_return

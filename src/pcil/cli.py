@@ -69,7 +69,7 @@ def _train(words: list[str]) -> int:
     if "task" not in given and not {"-h", "--help"} & set(words):
         raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
 
-    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name="")] = default) -> int:
+    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default) -> int:
         """Train a policy, or resume where a run stopped.
 
         The settings shown are those of the chosen method and preset. --reward my.module:MyReward takes a reward of your own

@@ -12,9 +12,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 LAYER_NORM_EPSILON = 1e-5
+SCALER_RATE = 1e-3
+"""Least share of a new batch in the running statistics of observations."""
+SCALER_FLOOR = 1e-2
+"""Least standard deviation that observations are divided by, in their own units."""
 
 
 def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Any, "in out"]:
@@ -75,6 +79,41 @@ class Trunk(eqx.Module):
         variance = (centred * centred).sum(axis=-1, keepdims=True) * share
         normal = centred / xp.sqrt(variance + LAYER_NORM_EPSILON)
         return xp.tanh(_add(normal * _rows(self.scale, normal), self.offset))
+
+
+class Scaler(eqx.Module):
+    """Running mean and variance of observations, and observations scaled by them."""
+
+    mean: Float[Any, " obs"]
+    variance: Float[Any, " obs"]
+    count: Float[Any, ""]
+    """Batches seen."""
+
+    @classmethod
+    def init(cls, obs_dim: int) -> Scaler:
+        return cls(jnp.zeros(obs_dim), jnp.ones(obs_dim), jnp.zeros(()))
+
+    def update(self, obs: Float[Array, "batch obs"]) -> Scaler:
+        """The plain average over the first batches, then over about the last `1 / SCALER_RATE`.
+
+        Mixing a batch of mean `m` and variance `v` at rate `r` into `mean` and `variance` gives the mixture's variance,
+        `(1 - r) variance + r v + r (1 - r) (m - mean)^2`.
+        """
+        rate = jnp.maximum(1 / (self.count + 1), SCALER_RATE)
+        shift = jnp.mean(obs, axis=0) - self.mean
+        variance = (1 - rate) * (self.variance + rate * shift**2) + rate * jnp.var(obs, axis=0)
+        return Scaler(self.mean + rate * shift, variance, self.count + 1)
+
+    def _deviation(self) -> Float[Array, " obs"]:
+        return jnp.sqrt(self.variance + SCALER_FLOOR**2)
+
+    def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
+        return (obs - _rows(self.mean, obs)) / _rows(self._deviation(), obs)
+
+    def fold(self, trunk: Trunk) -> Trunk:
+        """The trunk that gives for plain observations what `trunk` gives for scaled ones: its first layer is linear."""
+        weight = trunk.weight / self._deviation()[:, None]
+        return Trunk(weight, trunk.bias - self.mean @ weight, trunk.scale, trunk.offset)
 
 
 class Actor(eqx.Module):

@@ -17,20 +17,22 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.agents.base import Agent, Metrics
 from pcil.errors import check_ranges
 from pcil.losses import n_step_target
-from pcil.networks import Actor, Critic
+from pcil.networks import Actor, Critic, Scaler
 from pcil.noise import LinearSchedule, perturb
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
 
 class DrQV2State(eqx.Module):
-    """Networks, the critic's slow copy (trunk included) and the optimiser's moments."""
+    """Networks, the critic's slow copy (trunk included), the optimiser's moments, and the scale of observations."""
 
     actor: Actor
+    """Of scaled observations, as the critic; `DrQV2.actor` gives the one of plain observations."""
     critic: Critic
     critic_target: Critic
     actor_moments: Moments
     critic_moments: Moments
+    scaler: Scaler | None
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,9 @@ class DrQV2(Agent):
     """Standard deviation of the exploration noise over agent steps."""
     noise_clip: float = 0.3
     """Bound on the noise of the actions inside the updates; acting has no bound."""
+    standardise: bool = False
+    """Give the trunks observations of running mean 0 and standard deviation 1: layer normalisation forgets an observation's
+    length, and entries in large units drown the others."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,7 +67,8 @@ class DrQV2(Agent):
         actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=actor_key)
         critic = Critic.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=critic_key)
         target = jax.tree.map(jnp.copy, critic)
-        return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic))
+        scaler = Scaler.init(spec.obs_dim) if self.standardise else None
+        return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic), scaler)
 
     def critic_loss(
         self,
@@ -90,6 +96,9 @@ class DrQV2(Agent):
         return n_step_target(window.reward, window.discount, jnp.minimum(first, second), self.gamma)
 
     def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
+        scaler = state.scaler and state.scaler.update(window.obs[:, 0])
+        if scaler is not None:
+            window = window._replace(obs=scaler(window.obs))
         obs, action = window.obs[:, 0], window.action[:, 0]
         noise = self.noise(step) * jax.random.normal(key, (2, *action.shape))
         noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
@@ -103,13 +112,15 @@ class DrQV2(Agent):
 
         critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
         metrics |= {"actor_loss": loss}
-        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments), metrics
+        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments, scaler), metrics
 
     def actor(self, state: DrQV2State) -> Actor:
-        return state.actor
+        if state.scaler is None:
+            return state.actor
+        return eqx.tree_at(lambda actor: actor.trunk, state.actor, state.scaler.fold(state.actor.trunk))
 
     def embed(self, state: DrQV2State, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch features"]:
-        return state.critic.trunk(obs)
+        return state.critic.trunk(obs if state.scaler is None else state.scaler(obs))
 
     def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
         mean = actor(obs, np)

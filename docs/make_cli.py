@@ -61,13 +61,13 @@ def _reward_options(text: str) -> str:
 def page() -> str:
     """The whole of cli.md."""
     from pcil.cli import COMMANDS
-    from pcil.rewards import REWARDS
+    from pcil.presets import METHODS
 
     parts = [INTRODUCTION, _block(help_of())]
     for command in COMMANDS:
         parts += [f"## pcil {command}\n", _block(help_of(command))]
         if command == "train":
-            for method in list(REWARDS)[1:]:
+            for method in METHODS[1:]:
                 options = _reward_options(help_of("train", "--method", method))
                 parts += [f"With `--method {method}` the reward's options are:\n", _block(options)]
     return "\n".join(parts)

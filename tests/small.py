@@ -12,7 +12,7 @@ from pcil import demos, envs, presets
 from pcil.config import Run
 from pcil.envs.toy import PointMass
 from pcil.noise import LinearSchedule
-from pcil.types import Batch
+from pcil.types import Batch, Window
 
 POINT_MASS = "toy/point_mass-v0"
 
@@ -59,3 +59,11 @@ def random_batch(rows: int, obs_dim: int, action_dim: int, seed: int = 0) -> Bat
     rng = np.random.default_rng(seed)
     obs = rng.standard_normal((rows, obs_dim), dtype=np.float32)
     return Batch(obs, rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32))
+
+
+def windows(batch: Batch, n: int = 1) -> Window:
+    """Every window of `n` steps of these rows, as if they were one episode without rewards; the last row ends it."""
+    starts = np.arange(len(batch.obs) - n)
+    steps = starts[:, None] + np.arange(n + 1)
+    ones = np.ones((len(starts), n), np.float32)
+    return Window(batch.obs[steps], batch.action[steps[:, :-1]], 0 * ones, ones, np.zeros(len(starts), np.int32))

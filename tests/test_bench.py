@@ -102,13 +102,15 @@ def update_products(run: Run, spec: Spec) -> list[Any]:
 
     count = jax.ShapeDtypeStruct((), np.int32)
     batch, n, expert = run.agent.batch_size, run.agent.n_step, run.reward.batch_size
-    demos = Batch(numbers(1000, spec.obs_dim), numbers(1000, spec.action_dim))
+    demos = (Batch(numbers(1000, spec.obs_dim), numbers(1000, spec.action_dim)),)
     state = jax.eval_shape(functools.partial(learner.init, run.learner, spec), demos, count)
-    window = Window(
-        numbers(batch, n + 1, spec.obs_dim), numbers(batch, n, spec.action_dim), numbers(batch, n), numbers(batch, n)
-    )
-    rows = Batch(numbers(expert, spec.obs_dim), numbers(expert, spec.action_dim))
-    return products(functools.partial(learner.update, run.learner), state, window, rows, count, count)
+
+    def steps(rows: int, n: int) -> Window:
+        shapes = (rows, n + 1, spec.obs_dim), (rows, n, spec.action_dim), (rows, n), (rows, n)
+        return Window(*(numbers(*shape) for shape in shapes), jax.ShapeDtypeStruct((rows,), np.int32))
+
+    update = functools.partial(learner.update, run.learner)
+    return products(update, state, steps(batch, n), steps(expert, 1), None, count, count)
 
 
 @pytest.mark.parametrize("preset", ["paper", "default"])

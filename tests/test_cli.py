@@ -18,7 +18,6 @@ import pcil
 from pcil import arguments, cli, presets
 from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
-from pcil.rewards import REWARDS
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
@@ -85,7 +84,7 @@ def test_an_unknown_task_names_the_ten(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_an_unknown_method_names_the_methods(capsys: pytest.CaptureFixture[str]) -> None:
     said = refused(["train", "walker_walk", "--method", "gial", "--out", "new"], capsys)
-    assert "'gial'" in said and all(name in said for name in REWARDS)
+    assert "'gial'" in said and all(name in said for name in presets.METHODS)
 
 
 def test_an_unknown_preset_names_the_presets(capsys: pytest.CaptureFixture[str]) -> None:

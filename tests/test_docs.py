@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from pcil import checkpoint, learner, presets
-from pcil.agents import DrQV2
+from pcil.agents import BC, DrQV2
 from pcil.config import Run
-from pcil.rewards import DAC, PCIL, Reward
-from pcil.types import Batch, Spec, Window
-from small import narrow, random_batch, small_run
+from pcil.rewards import REWARDS, Reward, TaskReward
+from pcil.types import Episode, Spec
+from small import narrow, random_batch, small_run, windows
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -29,6 +29,9 @@ NAME = re.compile(r"`(pcil(?:\.\w+)*):(\w+(?:\.\w+)*)`")
 TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 LINK = re.compile(r"\]\((?!https?:)([^)\s]+)\)")
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+CLASSES = {kind.__name__: kind for kind in (DrQV2, BC, *REWARDS.values()) if kind is not TaskReward}
+"""Agents and rewards whose settings have a table."""
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -103,9 +106,9 @@ def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
 
 def of(run: Run, kind: str) -> dict[str, Any]:
     """The settings of a run that a table of this class lists."""
-    if kind == "DrQV2":
+    if kind in ("DrQV2", "BC"):
         return flat(run.agent)
-    if kind in ("PCIL", "DAC"):
+    if kind in CLASSES:
         return flat(run.reward)
     return {
         name: value
@@ -120,13 +123,19 @@ def cell_value(cell: str, task: str) -> Any:
     return ast.literal_eval(special if special and task.startswith("walker") else general)
 
 
+def made_of(method: str) -> tuple[str, str]:
+    """The classes of a method's agent and reward."""
+    run = presets.make("walker_walk", method)
+    return type(run.agent).__name__, type(run.reward).__name__
+
+
 def test_the_settings_tables_say_what_the_code_says() -> None:
     """Every field is there, and its default and its value in each preset are as written."""
     tables = settings_tables()
-    assert sorted(kind for kind, _ in tables) == ["DAC", "DrQV2", "PCIL", "Run"]
-    bare = {"PCIL": PCIL(), "DAC": DAC(), "DrQV2": DrQV2()}
+    assert sorted(kind for kind, _ in tables) == sorted([*CLASSES, "Run"])
+    bare = {name: kind() for name, kind in CLASSES.items()}
     for kind, rows in tables:
-        method = "dac" if kind == "DAC" else "pcil"
+        method = next(m for m in presets.METHODS if kind in ("Run", *made_of(m)))
         names = [row[0].strip("`") for row in rows]
         own = flat(bare[kind]) if kind in bare else of(Run(task="finger_spin"), kind)
         assert sorted(names) == sorted(own), kind
@@ -156,14 +165,14 @@ def test_the_example_reward_is_what_it_says(tmp_path: Path, monkeypatch: pytest.
     def embed(obs: Any) -> Any:
         return obs
 
-    state = settings.init(demos, embed, key=jax.random.key(0))
+    state = settings.init([demos], embed, key=jax.random.key(0))
     got = settings.reward(state, jnp.asarray(states.obs), jnp.asarray(states.action), embed, key=jax.random.key(1))
     spread = demos.obs.std(axis=0) + 1e-3
     naive = [-min(np.linalg.norm((s - e) / spread) for e in demos.obs[::4]) for s in states.obs]
     assert got.shape == (7,) and np.allclose(got, naive, atol=1e-3)
     at_expert = settings.reward(state, jnp.asarray(demos.obs[:1]), jnp.zeros((1, 1)), embed, key=jax.random.key(1))
     assert float(at_expert[0]) == pytest.approx(0.0, abs=1e-2)
-    fresh = settings.init(random_batch(40, 3, 1, seed=9), embed, key=jax.random.key(0))
+    fresh = settings.init([random_batch(40, 3, 1, seed=9)], embed, key=jax.random.key(0))
     restored = checkpoint.unflatten("reward", fresh, checkpoint.flatten("reward", state))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(restored), jax.tree.leaves(state), strict=True))
 
@@ -172,24 +181,16 @@ def test_the_example_reward_goes_through_the_compiled_step(tmp_path: Path, monke
     """The same `init`, `update` and `label_episode` that train PCIL; the agent is trained on what the example pays."""
     settings = narrow(load_example(tmp_path, monkeypatch)())
     run = dataclasses.replace(small_run(), reward=settings)
-    spec, demos, rows, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.batch_size, run.agent.n_step
-    state = learner.init(run.learner, spec, demos, 0)
-    steps = random_batch(rows * (n + 1), 2, 2, seed=1)
-    window = Window(
-        steps.obs.reshape(rows, n + 1, 2),
-        steps.action.reshape(rows, n + 1, 2)[:, :n],
-        np.zeros((rows, n), np.float32),
-        np.ones((rows, n), np.float32),
-    )
-    expert = Batch(demos.obs[: settings.batch_size], demos.action[: settings.batch_size])
+    demos, rows, n = random_batch(50, 2, 2), run.agent.batch_size, run.agent.n_step
+    state = learner.init(run.learner, Spec(2, 2, 1), [demos], 0)
+    window = windows(random_batch(rows + n, 2, 2, seed=1), n)
     before = np.asarray(state.agent.critic.heads[0].weights[0])
-    state, actor = learner.update(run.learner, state, window, expert, np.int32(0), np.int32(0))
+    state, actor = learner.update(run.learner, state, window, None, None, np.int32(0), np.int32(0))
     assert not np.array_equal(before, state.agent.critic.heads[0].weights[0])
     assert float(state.totals["updates"]) == 1 and float(state.totals["agent/target"]) < 0
     assert actor(jnp.zeros((1, 2))).shape == (1, 2)
-    episode = np.concatenate([demos.obs[:10], demos.obs[:1] + 5])
-    true = np.zeros(10, np.float32)
-    learned, _ = learner.label_episode(run.learner, state, episode, demos.action[:10], true, np.int32(0))
+    episode = Episode(np.concatenate([demos.obs[:10], demos.obs[:1] + 5]), demos.action[:10], np.zeros(10, np.float32))
+    learned = learner.label_episode(run.learner, state, episode, 0)
     assert learned.shape == (10,) and learned.dtype == np.float32
     assert np.allclose(learned[:9], 0, atol=1e-2) and learned[9] < -1
 

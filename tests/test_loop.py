@@ -20,8 +20,8 @@ from pcil.config import Run
 from pcil.errors import InputError
 from pcil.metrics import WALL_CLOCK
 from pcil.policy import load_policy
-from pcil.types import Batch, Spec, Window
-from small import POINT_MASS, random_batch, save_point_mass_demos, small_run
+from pcil.types import Spec
+from small import POINT_MASS, random_batch, save_point_mass_demos, small_run, windows
 
 
 @pytest.fixture(scope="module")
@@ -288,12 +288,11 @@ def _update_once(label: str, task_reward: float) -> Any:
     """The agent's part after one update on a fixed window whose stored rewards are all `task_reward`."""
     run = small_run(label=label)
     spec, demos, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.n_step
-    state = learner.init(run.learner, spec, demos, 0)
-    flat = random_batch(32 * (n + 1), 2, 2, seed=1)
-    obs, action = flat.obs.reshape(32, n + 1, 2), flat.action.reshape(32, n + 1, 2)[:, :n]
-    window = Window(obs, action, np.full((32, n), task_reward, np.float32), np.ones((32, n), np.float32))
-    expert = Batch(demos.obs[:32], demos.action[:32])
-    state, _ = learner.update(run.learner, state, window, expert, np.int32(0), np.int32(0))
+    state = learner.init(run.learner, spec, [demos], 0)
+    window = windows(random_batch(32 + n, 2, 2, seed=1), n)
+    window = window._replace(reward=np.full_like(window.reward, task_reward))
+    expert = windows(random_batch(33, 2, 2))
+    state, _ = learner.update(run.learner, state, window, expert, None, np.int32(0), np.int32(0))
     return np.asarray(state.agent.critic.heads[0].weights[0])
 
 
@@ -305,16 +304,13 @@ def test_sampled_labels_replace_what_is_stored_and_stored_ones_do_not() -> None:
 def test_the_actor_that_update_returns_outlives_the_next_update() -> None:
     """The learner is overwritten in place; the actor that acts meanwhile must not be."""
     run = small_run("expert")
-    state = learner.init(run.learner, Spec(2, 2, 1), random_batch(0, 2, 2), 0)
-    flat = random_batch(128, 2, 2)
-    obs, action = flat.obs.reshape(32, 4, 2), flat.action.reshape(32, 4, 2)[:, :3]
-    window = Window(obs, action, np.ones((32, 3), np.float32), np.ones((32, 3), np.float32))
-    empty = random_batch(0, 2, 2)
-    state, actor = learner.update(run.learner, state, window, empty, np.int32(0), np.int32(0))
+    state = learner.init(run.learner, Spec(2, 2, 1), (), 0)
+    window = windows(random_batch(35, 2, 2), 3)
+    state, actor = learner.update(run.learner, state, window, None, None, np.int32(0), np.int32(0))
     host = loop.on_host(actor)
     before = host.head.weights[0].copy()
     assert np.array_equal(before, state.agent.actor.head.weights[0])
-    state, newer = learner.update(run.learner, state, window, empty, np.int32(1), np.int32(1))
+    state, newer = learner.update(run.learner, state, window, None, None, np.int32(1), np.int32(1))
     assert np.array_equal(host.head.weights[0], before)
     assert not np.array_equal(loop.on_host(newer).head.weights[0], before)
 

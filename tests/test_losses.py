@@ -23,7 +23,6 @@ gradient_penalty = jax.jit(losses.gradient_penalty, static_argnums=0)
 interpolate = jax.jit(losses.interpolate)
 binary_cross_entropy = jax.jit(losses.binary_cross_entropy)
 n_step_target = jax.jit(losses.n_step_target, static_argnums=3)
-pearson = jax.jit(losses.pearson)
 SHAPES = ((1, 1, 2), (4, 3, 5), (3, 8, 2))
 """Batch, negatives, dimensions: few, as each is compiled."""
 
@@ -323,29 +322,3 @@ def test_the_target_has_the_derivative_that_differences_show() -> None:
         reward, discount, bootstrap = (jnp.asarray(rng.random(shape)) for shape in ((4, 3), (4, 3), (4,)))
         assert n_step_target(reward, discount, bootstrap, 0.9).dtype == jnp.float64
         jax.test_util.check_grads(lambda *x: n_step_target(*x, 0.9), (reward, discount, bootstrap), order=1)
-
-
-# --- The correlation ---
-
-series = arrays.arrays(np.float64, 6, elements=st.integers(-100, 100).map(float))
-
-
-@law
-@given(series, series)
-def test_the_correlation_is_numpys(x: np.ndarray, y: np.ndarray) -> None:
-    with jax.enable_x64(True):
-        result = float(pearson(jnp.asarray(x), jnp.asarray(y)))
-    varies = np.ptp(x) > 0 and np.ptp(y) > 0
-    assert result == pytest.approx(np.corrcoef(x, y)[0, 1] if varies else 0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("constant", [0.0, 1.0, 0.1, 33.3, 1000.1])
-@pytest.mark.parametrize("length", [7, 500, 501])
-def test_what_does_not_vary_correlates_with_nothing(constant: float, length: int) -> None:
-    """Also where the mean of equal float32 numbers is not that number."""
-    flat, line = jnp.full(length, constant), jnp.linspace(0.0, 1.0, length)
-    assert float(pearson(flat, line)) == 0
-    assert float(pearson(line, flat)) == 0
-    assert float(pearson(flat, 0.3 * flat + 5.7)) == 0
-    assert float(pearson(line, 2 * line + 1)) == pytest.approx(1)
-    assert float(pearson(line, -line)) == pytest.approx(-1)

@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import hypothesis.extra.numpy as arrays
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcil.evaluate import Evaluation
-from pcil.metrics import EVAL_COLUMNS, WALL_CLOCK, MetricWriter, read_evaluations
+from pcil.metrics import EVAL_COLUMNS, WALL_CLOCK, MetricWriter, pearson, read_evaluations
 
 law = settings(deadline=None, derandomize=True, max_examples=20)
 NAMES = ("eval.csv", "train.jsonl")
@@ -158,3 +159,29 @@ def test_a_run_that_starts_anew_starts_with_empty_files_and_one_header(tmp_path:
     assert len((tmp_path / "train.jsonl").read_text().splitlines()) == 1
     with (tmp_path / "eval.csv").open() as file:
         assert [tuple(row) for row in csv.reader(file)] == [EVAL_COLUMNS, ("0", "0", "1.0", "10", "0.0")]
+
+
+# --- The correlation ---
+
+series = arrays.arrays(np.float64, 6, elements=st.integers(-100, 100).map(float))
+
+
+@law
+@given(series, series)
+def test_the_correlation_is_the_covariance_over_both_deviations(x: np.ndarray, y: np.ndarray) -> None:
+    varies = len(set(x)) > 1 and len(set(y)) > 1
+    covariance = sum(a * b for a, b in zip(x, y, strict=True)) / 6 - sum(x) / 6 * sum(y) / 6
+    expected = covariance / (np.std(x) * np.std(y)) if varies else 0.0
+    assert pearson(x, y) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("constant", [0.0, 1.0, 0.1, 33.3, 1000.1])
+@pytest.mark.parametrize("length", [7, 500, 501])
+def test_what_does_not_vary_correlates_with_nothing(constant: float, length: int) -> None:
+    """Also where the mean of equal float32 numbers is not that number."""
+    flat, line = np.full(length, constant, np.float32), np.linspace(0.0, 1.0, length, dtype=np.float32)
+    assert pearson(flat, line) == 0
+    assert pearson(line, flat) == 0
+    assert pearson(flat, 0.3 * flat + 5.7) == 0
+    assert pearson(line, 2 * line + 1) == pytest.approx(1)
+    assert pearson(line, -line) == pytest.approx(-1)

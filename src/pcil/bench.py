@@ -95,18 +95,19 @@ class Setup:
         def normal(*shape: int) -> np.ndarray:
             return rng.standard_normal(shape, dtype=np.float32)
 
-        demos = Batch(normal(5000, spec.obs_dim), normal(5000, spec.action_dim))
-        self.expert = Batch(demos.obs[: run.reward.batch_size], demos.action[: run.reward.batch_size])
         self.replay = Replay(50_000, spec.obs_dim, spec.action_dim)
         for _ in range(50):
             reward = rng.uniform(size=500)
             self.replay.add(Episode(normal(501, spec.obs_dim), np.tanh(normal(500, spec.action_dim)), reward), reward)
         self.window = self.replay.sample(rng, run.agent.batch_size, run.agent.n_step)
-        self.state = learner.init(run.learner, spec, demos if run.reward.needs_demos else self.expert, 0)
+        rows = run.reward.batch_size
+        self.expert = self.replay.sample(rng, rows, run.reward.span) if rows else None
+        demo = Batch(normal(500, spec.obs_dim), normal(500, spec.action_dim))
+        self.state = learner.init(run.learner, spec, (demo,) * 10, 0)
         self.actor = on_host(run.agent.actor(self.state.agent))
         self.obs = normal(spec.obs_dim)
         step = functools.partial(learner.update, run.learner)
-        jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, np.int32(0), np.int32(0))
+        jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, None, np.int32(0), np.int32(0))
         self.products = _products(list(_dot_generals(jaxpr.jaxpr)))
 
     def update(self, times: int) -> None:
@@ -118,7 +119,7 @@ class Setup:
 
         for _ in range(times):
             step, self.count = np.int32(self.count), self.count + 1
-            self.state, actor = learner.update(self.run.learner, self.state, self.window, self.expert, step, step)
+            self.state, actor = learner.update(self.run.learner, self.state, self.window, self.expert, None, step, step)
         jax.block_until_ready((self.state, actor))
 
     def floor(self, times: int) -> None:

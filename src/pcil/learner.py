@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil import seeds
 from pcil.config import Method
-from pcil.losses import pearson
-from pcil.networks import Actor
+from pcil.networks import Actor, Trunk
 from pcil.rewards import label
 from pcil.seeds import Stream
-from pcil.types import Batch, Spec, Window
+from pcil.types import Batch, Episode, Spec, Window
+
+LABEL_ROWS = 256
+"""Episodes are labelled in multiples of so many rows."""
 
 
 class Learner(eqx.Module):
@@ -31,46 +35,61 @@ class Learner(eqx.Module):
 
 
 @functools.partial(jax.jit, static_argnames=("method", "spec"))
-def init(method: Method, spec: Spec, demos: Batch, seed: int | Array) -> Learner:
-    """The state before the first update."""
+def init(method: Method, spec: Spec, demos: Sequence[Batch], seed: int | Array) -> Learner:
+    """The state before the first update; `demos` may be empty where nothing needs them."""
     root = jax.random.key_data(jax.random.key(seed))
     key = jax.random.wrap_key_data(root)
     agent = method.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
     reward = method.reward.init(demos, frozen_embed(method, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
-    n, rows = method.agent.n_step, method.agent.batch_size
-    shapes = (n + 1, spec.obs_dim), (n, spec.action_dim), (n,), (n,)
-    window = Window(*(jnp.zeros((rows, *shape)) for shape in shapes))
-    expert = Batch(*(jnp.zeros((method.reward.batch_size, size)) for size in (spec.obs_dim, spec.action_dim)))
-    metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, jnp.int32(0), jnp.int32(0))[1]
+    window = _zeros(spec, method.agent.batch_size, max(method.agent.n_step, method.reward.span))
+    expert = _zeros(spec, method.reward.batch_size, method.reward.span)
+    metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
     return eqx.tree_at(lambda s: s.totals, learner, {name: jnp.zeros(()) for name in [*sorted(metrics), "updates"]})
 
 
-def frozen_embed(method: Method, agent: Any) -> Any:
+def _zeros(spec: Spec, rows: int, n: int) -> Window:
+    """Windows with the shapes of real ones."""
+    shapes = (n + 1, spec.obs_dim), (n, spec.action_dim), (n,), (n,)
+    obs, action, reward, discount = (jnp.zeros((rows, *shape)) for shape in shapes)
+    return Window(obs, action, reward, discount, jnp.zeros(rows, jnp.int32))
+
+
+def frozen_embed(method: Method, agent: Any) -> Trunk:
     """The agent's features of an observation, through which no gradient flows."""
-    return lambda obs: jax.lax.stop_gradient(method.agent.embed(agent, obs))
+    return jax.lax.stop_gradient(method.agent.trunk(agent, method.reward.features))
 
 
 @functools.partial(jax.jit, static_argnames="method", donate_argnames="learner")
-def update(method: Method, learner: Learner, window: Window, expert: Batch, step: Array, count: Array) -> tuple[Learner, Actor]:
+def update(
+    method: Method, learner: Learner, window: Window, expert: Window | None, seen: Window | None, step: Array, count: Array
+) -> tuple[Learner, Actor]:
     """One update of the reward, then of the agent; `step` counts agent steps and `count` updates, both from 0.
 
-    The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
+    The reward learns from windows of the `expert` and from those that are `seen` of the agent: without them, from the first
+    rows of `window`, as in the authors' code. `expert` is None where no demonstrations are
+    drawn. The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
-    learner, metrics = _step(method, learner, window, expert, step, count)
+    learner, metrics = _step(method, learner, window, expert, seen, step, count)
     totals = {name: learner.totals[name] + value for name, value in {**metrics, "updates": 1.0}.items()}
     learner = eqx.tree_at(lambda s: s.totals, learner, totals)
     return learner, jax.tree.map(jnp.copy, method.agent.actor(learner.agent))
 
 
 def _step(
-    method: Method, learner: Learner, window: Window, expert: Batch, step: Array, count: Array
+    method: Method,
+    learner: Learner,
+    window: Window,
+    expert: Window | None,
+    seen: Window | None,
+    step: Array,
+    count: Array,
 ) -> tuple[Learner, dict[str, Array]]:
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
     embed = frozen_embed(method, learner.agent)
-    rows = expert.obs.shape[0]
-    seen = Batch(window.obs[:rows, 0], window.action[:rows, 0])
+    seen = seen or Window(*(array[: method.reward.batch_size] for array in window))
+    expert = expert or Window(*(array[:0] for array in window))
     reward_state, reward_metrics = method.reward.update(learner.reward, expert, seen, embed, key=reward_key)
     if method.label == "sampled":
         fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
@@ -81,12 +100,20 @@ def _step(
     return Learner(agent_state, reward_state, learner.root, learner.totals), metrics
 
 
+def label_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
+    """The reward of each step of one whole episode.
+
+    A reward of single steps is computed on a multiple of `LABEL_ROWS` rows, so that episodes of many lengths share a few
+    compilations; one of whole episodes is given exactly the episode.
+    """
+    steps = len(episode)
+    spare = -steps % LABEL_ROWS if method.reward.scope == "step" else 0
+    obs, action = (np.pad(array, ((0, spare), (0, 0)), mode="edge") for array in (episode.obs, episode.action))
+    true = np.pad(episode.reward.astype(np.float32), (0, spare))
+    return np.asarray(_label_rows(method, learner, obs, action, true, np.int32(count)))[:steps]
+
+
 @functools.partial(jax.jit, static_argnames="method")
-def label_episode(
-    method: Method, learner: Learner, obs: Array, action: Array, task_reward: Array, count: Array
-) -> tuple[Array, Array]:
-    """The reward of each step of one whole episode, and its correlation with the environment's: the method's health."""
+def _label_rows(method: Method, learner: Learner, obs: Array, action: Array, task_reward: Array, count: Array) -> Array:
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.LABEL, count)
-    embed = frozen_embed(method, learner.agent)
-    learned = label(method.reward, learner.reward, obs, action, task_reward, embed, key=key)
-    return learned, pearson(learned, task_reward)
+    return label(method.reward, learner.reward, obs, action, task_reward, frozen_embed(method, learner.agent), key=key)

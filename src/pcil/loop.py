@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -16,12 +18,15 @@ from pcil import checkpoint, envs, learner, seeds
 from pcil.config import Run
 from pcil.evaluate import Evaluation, evaluate
 from pcil.learner import Learner
-from pcil.metrics import MetricWriter
+from pcil.metrics import MetricWriter, pearson
 from pcil.networks import Actor
 from pcil.policy import Policy
 from pcil.replay import Replay
 from pcil.seeds import Stream
-from pcil.types import Batch, Episode, Spec
+from pcil.types import Episode, Spec
+
+OFFLINE_STEPS = 500
+"""Updates of an offline agent in one pass of the loop."""
 
 
 @runtime_checkable
@@ -58,6 +63,8 @@ class State:
     actor: Actor
     """The actor as it left the last update."""
     replay: Replay
+    expert: Replay | None
+    """The demonstrations; a checkpoint does not hold them."""
     counters: Counters
 
 
@@ -65,10 +72,11 @@ class Stopped(Exception):
     """The run was asked to stop, and has saved itself."""
 
 
-def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> State:
+def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Reporter) -> State:
     """Train until `run.frames`, resuming from the folder's newest whole checkpoint; each pass of the loop is one episode.
 
-    Returns the final state, with the final return in its counters. Raises `Stopped` where the reporter asks for it.
+    An offline agent has passes of `OFFLINE_STEPS` updates instead. `demos` may be empty where nothing needs them. Returns the
+    final state, with the final return in its counters. Raises `Stopped` where the reporter asks for it.
     """
     env = envs.make(run.task)
     spec = envs.spec(env)
@@ -82,11 +90,16 @@ def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> Stat
             if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
                 _evaluate(run, folder, state, rollout, log, clock, reporter)
 
-            episode = _play(run, env, spec, state, demos)
-            learned, correlation = _label(run, state, episode)
-            state.replay.add(episode, learned if run.label == "stored" else episode.reward)
-            _log_episode(state, episode, learned, correlation, log, clock)
-            reporter.episode(run, state.counters.frames, episode.total_reward)
+            if run.agent.offline:
+                _study(run, spec, state)
+                _log_pass(state, {}, log, clock)
+            else:
+                episode = _play(run, env, spec, state)
+                kept = episode.absorbed() if run.agent.absorbing else episode
+                learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
+                state.replay.add(kept, learned if run.label == "stored" else kept.reward)
+                _log_pass(state, _described(episode, learned), log, clock)
+                reporter.episode(run, state.counters.frames, episode.total_reward)
 
             stop = reporter.stop()
             if stop or clock.total() - saved >= run.checkpoint_seconds:
@@ -102,7 +115,7 @@ def train_loop(run: Run, folder: Path, demos: Batch, reporter: Reporter) -> Stat
     return state
 
 
-def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State, demos: Batch) -> Episode:
+def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
     """One episode: act, update (the device works while the environment steps), step."""
     counters = state.counters
     act_rng = seeds.rng(run.seed, Stream.ACT, counters.episodes)
@@ -118,12 +131,7 @@ def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State, demos: Batch) 
             host = host or on_host(state.actor)
             action = run.agent.explore(host, observations[-1], step=counters.steps, rng=act_rng)
         if _update_due(run, state.replay, counters):
-            window = state.replay.sample(sample_rng, run.agent.batch_size, run.agent.n_step)
-            rows = sample_rng.integers(max(len(demos.obs), 1), size=run.reward.batch_size)
-            expert = Batch(demos.obs[rows], demos.action[rows])
-            step, count = np.int32(counters.steps), np.int32(counters.updates)
-            state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, step, count)
-            counters, host = replace(counters, updates=counters.updates + 1), None
+            counters, host = _update(run, state, state.replay, counters, sample_rng), None
         obs, reward, terminated, truncated, _ = env.step(action)
         over = terminated or truncated
         observations.append(obs)
@@ -138,8 +146,31 @@ def _update_due(run: Run, replay: Replay, counters: Counters) -> bool:
     return (
         counters.frames >= run.seed_frames
         and counters.steps % run.update_every == 0
-        and replay.num_windows(run.agent.n_step) > 0
+        and replay.num_windows(max(run.agent.n_step, run.reward.span)) > 0
     )
+
+
+def _study(run: Run, spec: Spec, state: State) -> None:
+    """Updates on the demonstrations alone; each counts as the agent step that it takes the place of."""
+    assert state.expert is not None
+    counters = state.counters
+    rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
+    for _ in range(OFFLINE_STEPS):
+        if counters.frames < run.frames:
+            counters = _update(run, state, state.expert, counters, rng)
+            counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
+    state.counters = replace(counters, episodes=counters.episodes + 1)
+
+
+def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.random.Generator) -> Counters:
+    """Dispatch one update on draws from the replay and the demonstrations; returns the counters after it."""
+    rows, span = run.reward.batch_size, run.reward.span
+    window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
+    expert = state.expert.sample(rng, rows, span) if state.expert and rows else None
+    seen = replay.sample(rng, rows, span) if span > run.agent.n_step else None
+    step, count = np.int32(counters.steps), np.int32(counters.updates)
+    state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, seen, step, count)
+    return replace(counters, updates=counters.updates + 1)
 
 
 def on_host(actor: Actor) -> Actor:
@@ -147,28 +178,21 @@ def on_host(actor: Actor) -> Actor:
     return jax.tree.map(np.asarray, actor)
 
 
-def _label(run: Run, state: State, episode: Episode) -> tuple[np.ndarray, float]:
-    """The learned reward of each step of an episode, by the networks of this moment, and its correlation with the true one."""
-    count = np.int32(state.counters.episodes)
-    true = episode.reward.astype(np.float32)
-    learned, correlation = learner.label_episode(run.learner, state.learner, episode.obs, episode.action, true, count)
-    return np.asarray(learned), float(correlation)
-
-
-def _log_episode(
-    state: State, episode: Episode, learned: np.ndarray, correlation: float, log: MetricWriter, clock: _Clock
-) -> None:
-    """One line for the episode: its return, what the learned reward made of it, and the mean of each update's metrics."""
-    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items()}
-    updates = totals.pop("updates")
-    values: dict[str, Any] = {
-        "episode": state.counters.episodes,
+def _described(episode: Episode, learned: np.ndarray) -> dict[str, Any]:
+    """What an episode brought, what the learned reward made of it, and how the two correlate: the method's health."""
+    return {
         "return": episode.total_reward,
         "length": len(episode),
         "learned_return": float(learned.sum(dtype=np.float64)),
-        "correlation": correlation,
-        "updates": state.counters.updates,
+        "correlation": pearson(learned[: len(episode)], episode.reward),
     }
+
+
+def _log_pass(state: State, values: dict[str, Any], log: MetricWriter, clock: _Clock) -> None:
+    """One line for the episode, with the mean of each update's metrics."""
+    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items()}
+    updates = totals.pop("updates")
+    values = {"episode": state.counters.episodes, **values, "updates": state.counters.updates}
     values |= {name: total / updates for name, total in totals.items() if updates}
     values |= {"seconds": round(clock.total(), 2), "frames_per_second": round(clock.rate(state.counters.frames), 1)}
     log.episode(state.counters.frames, values)
@@ -203,11 +227,19 @@ def _evaluate(
     return result
 
 
-def _start(run: Run, spec: Spec, demos: Batch) -> State:
+def _start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     """The state before the first step."""
-    fresh = learner.init(run.learner, spec, demos, run.seed)
+    if run.agent.absorbing:
+        demos, spec = [episode.absorbed() for episode in demos], spec._replace(obs_dim=spec.obs_dim + 1)
+    fresh = learner.init(run.learner, spec, tuple(episode.batch for episode in demos), run.seed)
     replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
-    return State(fresh, jax.tree.map(jnp.copy, run.agent.actor(fresh.agent)), replay, Counters())
+    steps, reward = run.reward.prefill
+    for episode in itertools.cycle(demos):
+        if replay.num_steps >= steps:
+            break
+        replay.add(episode, np.full(len(episode), reward, np.float32))
+    actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
+    return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
 
 
 def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
@@ -233,7 +265,7 @@ def _resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[S
         fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
         reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
     actor = jax.tree.map(jnp.copy, run.agent.actor(restored.agent))
-    return State(restored, actor, fresh.replay, counters), meta["positions"]
+    return State(restored, actor, fresh.replay, fresh.expert, counters), meta["positions"]
 
 
 class _Clock:

@@ -79,11 +79,3 @@ def n_step_target(
     for k in reversed(range(reward.shape[1])):
         target = reward[:, k] + gamma * discount[:, k] * target
     return target
-
-
-def pearson(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, ""]:
-    """Pearson correlation; 0 where one of the two does not vary."""
-    x, y = x - x[0], y - y[0]  # exactly 0 where nothing varies, while `x - mean(x)` is a rounding error
-    x, y = x - jnp.mean(x), y - jnp.mean(y)
-    scale = jnp.sqrt(jnp.sum(x * x) * jnp.sum(y * y))
-    return jnp.where(scale > 1e-12, jnp.sum(x * y) / jnp.maximum(scale, 1e-12), 0.0)

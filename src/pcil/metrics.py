@@ -78,3 +78,10 @@ def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
     with (folder / "eval.csv").open() as file:
         rows = list(csv.DictReader(file))
     return {name: np.array([float(row[name]) for row in rows]) for name in EVAL_COLUMNS}
+
+
+def pearson(x: np.ndarray, y: np.ndarray) -> float:
+    """Pearson correlation; 0 where one of the two does not vary."""
+    if np.ptp(x) == 0 or np.ptp(y) == 0:
+        return 0.0
+    return float(np.corrcoef(x.astype(np.float64), y.astype(np.float64))[0, 1])

@@ -7,6 +7,7 @@ window. Rows wrap around the end of the ring; the oldest episodes leave, whole, 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ class Segment(NamedTuple):
     start: int
     length: int
     terminated: bool
+    number: int
+    """Episodes added before it, those that have left included."""
 
     def starts(self, n: int) -> int:
         """How many windows of `n` steps begin here: those that fit, and, if the episode terminated, every step."""
@@ -37,7 +40,17 @@ class Replay:
         self._reward = np.zeros(capacity, np.float32)
         self._segments: deque[Segment] = deque()
         self._next = 0
+        self._added = 0
         self._index: tuple[int, np.ndarray, np.ndarray] | None = None
+
+    @classmethod
+    def of(cls, episodes: Sequence[Episode]) -> Replay:
+        """A replay that holds just these episodes."""
+        rows = sum(len(episode) + 1 for episode in episodes)
+        full = cls(rows, episodes[0].obs.shape[1], episodes[0].action.shape[1])
+        for episode in episodes:
+            full.add(episode, episode.reward)
+        return full
 
     @property
     def num_steps(self) -> int:
@@ -72,7 +85,8 @@ class Replay:
         self._obs[index] = episode.obs
         self._action[index[:-1]], self._action[index[-1]] = episode.action, 0
         self._reward[index[:-1]], self._reward[index[-1]] = reward, 0
-        self._segments.append(Segment(self._next, len(episode), episode.terminated))
+        self._segments.append(Segment(self._next, len(episode), episode.terminated, self._added))
+        self._added += 1
         self._next = (self._next + rows) % self.capacity
         self._index = None
 
@@ -88,7 +102,7 @@ class Replay:
             raise InputError(f"The replay holds no window of {n} steps: every episode in it is shorter.")
         draw = rng.integers(total, size=batch)
         which = np.searchsorted(cumulative, draw, side="right")
-        start, length, terminated, before = table[which].T
+        start, length, terminated, number, before = table[which].T
         offset = (draw - before)[:, None] + np.arange(n + 1)
         row = (start[:, None] + np.minimum(offset, length[:, None])) % self.capacity
         inside = offset[:, :-1] < length[:, None]
@@ -98,6 +112,7 @@ class Replay:
             self._action[row[:, :-1]],
             self._reward[row[:, :-1]],
             alive.astype(np.float32),
+            number.astype(np.int32),
         )
 
     def state(self) -> dict[str, np.ndarray]:
@@ -109,14 +124,15 @@ class Replay:
             "obs": self._obs[index],
             "action": self._action[index],
             "reward": self._reward[index],
-            "segments": np.array(self._segments, np.int64).reshape(-1, 3),
+            "segments": np.array(self._segments, np.int64).reshape(-1, 4),
             "next": np.array(self._next),
+            "added": np.array(self._added),
         }
 
     def load(self, state: dict[str, np.ndarray]) -> None:
         """Restore what `state` gave; rows return to the places they had."""
-        self._segments = deque(Segment(int(s), int(k), bool(t)) for s, k, t in state["segments"])
-        self._next = int(state["next"])
+        self._segments = deque(Segment(int(s), int(k), bool(t), int(i)) for s, k, t, i in state["segments"])
+        self._next, self._added = int(state["next"]), int(state["added"])
         first = self._segments[0].start if self._segments else self._next
         index = (first + np.arange(len(state["obs"]))) % self.capacity
         self._obs[index], self._action[index], self._reward[index] = state["obs"], state["action"], state["reward"]
@@ -126,10 +142,10 @@ class Replay:
         return self.capacity - sum(segment.length + 1 for segment in self._segments)
 
     def _starts(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """One row `(start, length, terminated, valid starts before)` an episode, and the running total of valid starts."""
+        """A row `(start, length, terminated, number, valid starts before)` an episode, and the total of valid starts."""
         if self._index is None or self._index[0] != n:
             counts = np.array([segment.starts(n) for segment in self._segments], np.int64)
             cumulative = np.cumsum(counts)
-            table = np.array(self._segments, np.int64).reshape(-1, 3)
+            table = np.array(self._segments, np.int64).reshape(-1, 4)
             self._index = n, np.column_stack([table, cumulative - counts]), cumulative
         return self._index[1], self._index[2]

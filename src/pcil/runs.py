@@ -14,15 +14,12 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pcil import compilation, envs, loop, presets
 from pcil.config import Run, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
 from pcil.evaluate import Evaluation
 from pcil.policy import Policy, load_policy
-from pcil.types import Batch
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
@@ -84,7 +81,7 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     with _claimed(folder), _full_disk_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
-            final = loop.train_loop(run, folder, _batch(demos, run), reporter).counters.final_return
+            final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter).counters.final_return
             _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
 
@@ -95,19 +92,12 @@ def read_done(folder: Path) -> float:
 
 
 def demonstrations(run: Run) -> Demonstrations | None:
-    """What the run imitates, checked against its environment, or None where its reward needs no demonstrations."""
+    """What the run imitates, checked against its environment, or None where it needs no demonstrations."""
     environment = envs.make(run.task)
-    if not run.reward.needs_demos:
+    if not run.reward.needs_demos and not run.agent.offline:
         return None
     source = run.task if run.demos is None else run.demos
     return Demonstrations.load(source).take(run.num_demos).validate(envs.spec(environment))
-
-
-def _batch(demos: Demonstrations | None, run: Run) -> Batch:
-    if demos is not None:
-        return Batch(demos.obs, demos.action)
-    spec = envs.spec(envs.make(run.task))
-    return Batch(np.zeros((0, spec.obs_dim), np.float32), np.zeros((0, spec.action_dim), np.float32))
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from pcil.errors import InputError
 
@@ -39,6 +39,8 @@ class Window(NamedTuple):
     action: Float[Any, "batch n action"]
     reward: Float[Any, "batch n"]
     discount: Float[Any, "batch n"]
+    number: Int[Any, " batch"]
+    """Which episode each window is from, counted from 0 over all that were ever added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,26 @@ class Episode:
 
     def __len__(self) -> int:
         return len(self.action)
+
+    @property
+    def batch(self) -> Batch:
+        """The states in which an action was taken, and those actions."""
+        return Batch(self.obs[:-1], self.action)
+
+    def absorbed(self) -> Episode:
+        """The same episode with a further entry in each observation, 1 in the absorbing state and 0 elsewhere.
+
+        An episode that terminated ends in the absorbing state (zeros and the 1) in place of its last observation, and takes
+        one step from there to itself, with action and reward 0; so nothing terminates, and a reward learned on such episodes
+        values an early end as it values any other state (Kostrikov et al. 2019, section 4.2).
+        """
+        obs = np.pad(self.obs, ((0, 0), (0, 1)))
+        if not self.terminated:
+            return Episode(obs, self.action, self.reward, False, self.seed)
+        rest = np.zeros((2, obs.shape[1]), obs.dtype)
+        rest[:, -1] = 1
+        action, reward = np.pad(self.action, ((0, 1), (0, 0))), np.pad(self.reward, (0, 1))
+        return Episode(np.concatenate([obs[:-1], rest]), action, reward, False, self.seed)
 
     @property
     def total_reward(self) -> float:

@@ -16,7 +16,7 @@ from pcil import envs, loop, runs
 from pcil.agents import DrQV2
 from pcil.envs.toy import PointMass
 from pcil.seeds import Stream, episode_seed
-from pcil.types import Batch, Spec, Window
+from pcil.types import Spec, Window
 from small import narrow, random_batch, small_run
 
 SPEC = Spec(3, 2, 1)
@@ -28,7 +28,9 @@ def make_window(discount: float = 1.0, seed: int = 0) -> Window:
     flat = random_batch(32 * 4, 3, 2, seed)
     reward = rng.standard_normal((32, 3), dtype=np.float32)
     obs, action = flat.obs.reshape(32, 4, 3), flat.action.reshape(32, 4, 2)[:, :3]
-    return jax.tree.map(jnp.asarray, Window(obs, action, reward, np.full((32, 3), discount, np.float32)))
+    return jax.tree.map(
+        jnp.asarray, Window(obs, action, reward, np.full((32, 3), discount, np.float32), np.zeros(32, np.int32))
+    )
 
 
 def test_target_is_the_discounted_rewards_and_the_smaller_slow_value() -> None:
@@ -60,9 +62,9 @@ def test_actor_update_leaves_the_critic_alone_and_raises_its_value() -> None:
     """The critic's gradient comes from its own loss only; a small step of the actor's raises min(Q1, Q2)."""
     state, window = AGENT.init(SPEC, key=jax.random.key(0)), make_window()
     obs, noise = jnp.asarray(window.obs[:, 0]), jnp.zeros((32, 2))
-    loss, gradient = jax.value_and_grad(AGENT.actor_loss)(state.actor, state.critic, obs, noise)
+    loss, gradient = jax.value_and_grad(AGENT.actor_loss)(state.actor, state.critic, obs, noise, jnp.ones(32))
     moved = jax.tree.map(lambda weight, slope: weight - 1e-2 * slope, state.actor, gradient)
-    assert AGENT.actor_loss(moved, state.critic, obs, noise) < loss
+    assert AGENT.actor_loss(moved, state.critic, obs, noise, jnp.ones(32)) < loss
     values = state.critic(obs, state.actor(obs))
     assert loss == pytest.approx(-float(jnp.mean(jnp.minimum(*values))), abs=1e-6)
 
@@ -76,7 +78,7 @@ def test_losses_against_finite_differences() -> None:
         noise = jnp.zeros((32, 2))
         losses = (
             (lambda critic: AGENT.critic_loss(critic, obs, action, target)[0], state.critic),
-            (lambda actor: AGENT.actor_loss(actor, state.critic, obs, noise), state.actor),
+            (lambda actor: AGENT.actor_loss(actor, state.critic, obs, noise, jnp.ones(32)), state.actor),
         )
         for loss, network in losses:
             check_grads(jax.jit(loss), (network,), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
@@ -97,8 +99,7 @@ def trained_on(task: str, folder: Path, frames: int = 1200) -> loop.State:
     agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05)
     run = small_run("expert", task, frames=frames, random_frames=frames, evaluate_every=frames, agent=agent, update_every=1)
     folder.mkdir()
-    empty = Batch(np.zeros((0, 1), np.float32), np.zeros((0, 1), np.float32))
-    return loop.train_loop(run, folder, empty, runs.Silent())
+    return loop.train_loop(run, folder, (), runs.Silent())
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5])

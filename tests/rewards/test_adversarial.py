@@ -11,7 +11,7 @@ import pytest
 
 from pcil.networks import MLP
 from pcil.rewards.adversarial import DAC, DiscriminatorState
-from small import narrow, random_batch
+from small import narrow, random_batch, windows
 
 SETTINGS = narrow(DAC())
 
@@ -39,13 +39,14 @@ def test_loss_equals_a_naive_one() -> None:
 
 def test_penalty_keeps_the_slope_near_one() -> None:
     """Without it the logits of separable data grow without bound."""
-    expert, agent = random_batch(32, 5, 1, 1), random_batch(32, 5, 1, 2)
+    expert, agent = random_batch(33, 5, 1, 1), random_batch(33, 5, 1, 2)
     expert = expert._replace(obs=expert.obs + 3)
     gaps = []
     for penalty in (0.0, 10.0):
         settings = dataclasses.replace(SETTINGS, penalty=penalty, learning_rate=1e-2)
-        state = settings.init(expert, lambda x: x, key=jax.random.key(0))
-        update = jax.jit(lambda s, k, settings=settings: settings.update(s, expert, agent, lambda x: x, key=k))
+        state = settings.init([expert], lambda x: x, key=jax.random.key(0))
+        pair = windows(expert), windows(agent)
+        update = jax.jit(lambda s, k, settings=settings, pair=pair: settings.update(s, *pair, lambda x: x, key=k))
         for i in range(150):
             state, metrics = update(state, jax.random.key(i))
         gaps.append(float(metrics["expert_logit"] - metrics["agent_logit"]))

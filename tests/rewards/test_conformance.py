@@ -10,25 +10,29 @@ import numpy as np
 import pytest
 
 from pcil import checkpoint
+from pcil.networks import Trunk
 from pcil.rewards import REWARDS, Reward, label
-from pcil.types import Batch
-from small import narrow, random_batch
+from pcil.types import Batch, Window
+from small import narrow, random_batch, windows
 
 FEATURES = 5
 
 
-def embed(obs: Any) -> Any:
-    """A fixed stand-in for the agent's trunk."""
-    mix = np.random.default_rng(3).standard_normal((obs.shape[-1], FEATURES), dtype=np.float32)
-    return jnp.tanh(jnp.asarray(obs) @ mix)
+embed = Trunk.init(4, FEATURES, key=jax.random.key(3))
 
 
 EXPERT = Batch(random_batch(200, 4, 2, seed=1).obs * 0.3 + 1.0, random_batch(200, 4, 2, seed=1).action)
 AGENT = Batch(random_batch(200, 4, 2, seed=2).obs * 0.3 - 1.0, random_batch(200, 4, 2, seed=2).action)
+DEMOS = [Batch(EXPERT.obs[i : i + 100], EXPERT.action[i : i + 100]) for i in (0, 100)]
 
 
-def rows(batch: Batch, start: int, size: int) -> Batch:
-    return Batch(batch.obs[start : start + size], batch.action[start : start + size])
+def rows(batch: Batch, start: int, size: int, span: int = 1) -> Window:
+    """`size` windows of the batch from a start on."""
+    return Window(*(array[start : start + size] for array in windows(batch, span)))
+
+
+def scaled(batch: Batch, scale: float) -> Batch:
+    return Batch(batch.obs * np.float32(scale), batch.action)
 
 
 @pytest.fixture(params=list(REWARDS), scope="module")
@@ -40,11 +44,10 @@ def settings(request: pytest.FixtureRequest) -> Reward:
 def trained(settings: Reward) -> Any:
     """The state after 60 updates on an expert and an agent that live apart."""
     update = jax.jit(lambda state, expert, agent, key: settings.update(state, expert, agent, embed, key=key)[0])
-    state = settings.init(EXPERT, embed, key=jax.random.key(0))
+    state = settings.init(DEMOS, embed, key=jax.random.key(0))
     for i in range(60):
         start = (i * 32) % 160
-        size = settings.batch_size
-        state = update(state, rows(EXPERT, start, size), rows(AGENT, start, size), jax.random.key(i))
+        state = update(state, *(rows(b, start, settings.batch_size, settings.span) for b in (EXPERT, AGENT)), jax.random.key(i))
     return state
 
 
@@ -53,19 +56,18 @@ def rewards_of(settings: Reward, state: Any, batch: Batch) -> np.ndarray:
 
 
 def test_shape_dtype_and_finite(settings: Reward, trained: Any) -> None:
-    got = rewards_of(settings, trained, rows(AGENT, 0, 17))
+    got = rewards_of(settings, trained, Batch(AGENT.obs[:17], AGENT.action[:17]))
     assert got.shape == (17,) and got.dtype == np.float32 and np.isfinite(got).all()
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-20, 1e6])
 def test_finite_under_extreme_inputs(settings: Reward, scale: float) -> None:
-    size = settings.batch_size
-    expert, agent = (Batch(rows(b, 0, size).obs * np.float32(scale), rows(b, 0, size).action) for b in (EXPERT, AGENT))
-    state = settings.init(Batch(EXPERT.obs * np.float32(scale), EXPERT.action), embed, key=jax.random.key(0))
+    expert, agent = (rows(scaled(b, scale), 0, settings.batch_size, settings.span) for b in (EXPERT, AGENT))
+    state = settings.init([scaled(demo, scale) for demo in DEMOS], embed, key=jax.random.key(0))
     update = jax.jit(lambda s, e, a: settings.update(s, e, a, embed, key=jax.random.key(1)))
     state, metrics = update(state, expert, agent)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))
-    assert np.isfinite(rewards_of(settings, state, Batch(AGENT.obs * np.float32(scale), AGENT.action))).all()
+    assert np.isfinite(rewards_of(settings, state, scaled(AGENT, scale))).all()
 
 
 def test_jit_equals_no_jit(settings: Reward, trained: Any) -> None:
@@ -76,15 +78,13 @@ def test_jit_equals_no_jit(settings: Reward, trained: Any) -> None:
 
 def test_deterministic(settings: Reward, trained: Any) -> None:
     assert np.array_equal(rewards_of(settings, trained, AGENT), rewards_of(settings, trained, AGENT))
-    size = settings.batch_size
-    one, two = (
-        settings.update(trained, rows(EXPERT, 0, size), rows(AGENT, 0, size), embed, key=jax.random.key(5))[0] for _ in "ab"
-    )
+    batches = [rows(b, 0, settings.batch_size, settings.span) for b in (EXPERT, AGENT)]
+    one, two = (settings.update(trained, *batches, embed, key=jax.random.key(5))[0] for _ in "ab")
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
 
 
 def test_inputs_unchanged(settings: Reward, trained: Any) -> None:
-    expert, agent = rows(EXPERT, 0, settings.batch_size), rows(AGENT, 0, settings.batch_size)
+    expert, agent = (rows(b, 0, settings.batch_size, settings.span) for b in (EXPERT, AGENT))
     before = [array.copy() for array in (*expert, *agent)]
     settings.update(trained, expert, agent, embed, key=jax.random.key(5))
     rewards_of(settings, trained, AGENT)
@@ -93,7 +93,7 @@ def test_inputs_unchanged(settings: Reward, trained: Any) -> None:
 
 def test_state_survives_a_checkpoint(settings: Reward, trained: Any) -> None:
     arrays = checkpoint.flatten("reward", trained)
-    fresh = settings.init(EXPERT, embed, key=jax.random.key(77))
+    fresh = settings.init(DEMOS, embed, key=jax.random.key(77))
     restored = checkpoint.unflatten("reward", fresh, arrays)
     assert np.array_equal(rewards_of(settings, restored, AGENT), rewards_of(settings, trained, AGENT))
 

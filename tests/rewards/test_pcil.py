@@ -16,7 +16,7 @@ from pcil.losses import gradient_penalty
 from pcil.networks import MLP, unit_sphere
 from pcil.rewards.pcil import PCIL, derangement, similarity
 from pcil.types import Batch, Spec
-from small import narrow, random_batch, small_run
+from small import narrow, random_batch, small_run, windows
 
 
 def features(seed: int, rows: int = 32, dim: int = 6) -> jnp.ndarray:
@@ -102,23 +102,24 @@ def test_similarity_by_hand() -> None:
 def test_reward_lies_between_minus_one_and_one(compare: str) -> None:
     settings = dataclasses.replace(SETTINGS, compare=compare)
     batch = random_batch(300, 6, 1)
-    state = settings.init(batch, lambda obs: obs * 50, key=jax.random.key(0))
+    state = settings.init([batch], lambda obs: obs * 50, key=jax.random.key(0))
     got = settings.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), lambda obs: obs * 50, key=jax.random.key(1))
     assert np.abs(got).max() <= 1 + 1e-6 and np.std(got) > 0
 
 
 def test_embedding_has_a_quarter_of_the_width_and_four_layers() -> None:
     """256-256-256-64 at the paper's width (Appendix B)."""
-    state = PCIL(hidden=256).init(random_batch(9, 50, 1), lambda obs: obs, key=jax.random.key(0))
+    state = PCIL(hidden=256).init([random_batch(9, 50, 1)], lambda obs: obs, key=jax.random.key(0))
     assert [weight.shape for weight in state.encoder.weights] == [(50, 256), (256, 256), (256, 256), (256, 64)]
 
 
 def test_an_update_draws_experts_together_and_pushes_the_agent_away() -> None:
     """The sign of Eq. 1 as corrected: the margin between positive and negative similarity grows."""
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-2, penalty=0.0)
-    expert, agent = random_batch(32, 6, 1, 1), random_batch(32, 6, 1, 2)
-    expert = Batch(expert.obs + 0.5, expert.action)
-    state = settings.init(expert, lambda obs: obs, key=jax.random.key(0))
+    demo, agent = random_batch(33, 6, 1, 1), windows(random_batch(33, 6, 1, 2))
+    demo = Batch(demo.obs + 0.5, demo.action)
+    expert = windows(demo)
+    state = settings.init([demo], lambda obs: obs, key=jax.random.key(0))
     margins = []
     for i in range(50):
         state, metrics = settings.update(state, expert, agent, lambda obs: obs, key=jax.random.key(i))
@@ -127,10 +128,10 @@ def test_an_update_draws_experts_together_and_pushes_the_agent_away() -> None:
 
 
 def test_reference_is_the_last_expert_batch() -> None:
-    expert, agent = random_batch(32, 6, 1, 1), random_batch(32, 6, 1, 2)
-    state = SETTINGS.init(random_batch(99, 6, 1, 3), lambda obs: obs, key=jax.random.key(0))
+    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    state = SETTINGS.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
     after, _ = SETTINGS.update(state, expert, agent, lambda obs: obs, key=jax.random.key(1))
-    assert np.array_equal(after.reference, expert.obs) and not np.array_equal(state.reference, expert.obs)
+    assert np.array_equal(after.reference, expert.obs[:, 0]) and not np.array_equal(state.reference, expert.obs[:, 0])
 
 
 def test_no_anchor_is_its_own_positive() -> None:
@@ -147,7 +148,7 @@ def test_nothing_flows_into_the_agents_features() -> None:
 
     def loss(trained: object) -> jnp.ndarray:
         embed = frozen_embed(run.learner, trained)
-        state = SETTINGS.init(batch, embed, key=jax.random.key(0))
+        state = SETTINGS.init([batch], embed, key=jax.random.key(0))
         return jnp.sum(SETTINGS.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), embed, key=jax.random.key(1)))
 
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(jax.grad(loss, allow_int=True)(agent)) if leaf.dtype == np.float32)

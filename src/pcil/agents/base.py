@@ -5,13 +5,13 @@ from __future__ import annotations
 import abc
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.networks import Actor
+from pcil.networks import Actor, Trunk
 from pcil.types import Spec, Window
 
 Metrics = dict[str, Float[Array, ""]]
@@ -19,12 +19,19 @@ Metrics = dict[str, Float[Array, ""]]
 
 @dataclass(frozen=True)
 class Agent(abc.ABC):
-    """Settings of an agent; all that changes is in the state, a pytree that goes in and comes out."""
+    """Settings of an agent; all that changes is in the state, a pytree that goes in and comes out.
+
+    `offline` is True for one that learns from the demonstrations alone, without a step in the environment.
+    """
+
+    offline: ClassVar[bool] = False
 
     batch_size: int = 128
     """Windows in one update."""
     n_step: int = 3
     """Steps of reward before the target bootstraps: the length of a window."""
+    absorbing: bool = False
+    """Let a termination lead into an absorbing state, which observations mark by a further entry; no end is free then."""
 
     def __post_init__(self) -> None:
         check_ranges(self, batch_size=(1, inf), n_step=(1, inf))
@@ -42,8 +49,8 @@ class Agent(abc.ABC):
         """The part of the state that acts; it is all that leaves the device between updates."""
 
     @abc.abstractmethod
-    def embed(self, state: Any, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch features"]:
-        """The features on which imitation rewards are learned; they are not trained by them."""
+    def trunk(self, state: Any, whose: Literal["critic", "actor"]) -> Trunk:
+        """The features of an observation on which imitation rewards are learned; they are not trained by them."""
 
     @abc.abstractmethod
     def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.agents.base import Agent, Metrics
 from pcil.errors import check_ranges
 from pcil.losses import n_step_target
-from pcil.networks import Actor, Critic, Scaler
+from pcil.networks import Actor, Critic, Scaler, Trunk
 from pcil.noise import LinearSchedule, perturb
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
@@ -83,31 +84,40 @@ class DrQV2(Agent):
         return loss, {"critic_loss": loss, "value": jnp.mean(first), "target": jnp.mean(target)}
 
     def actor_loss(
-        self, actor: Actor, critic: Critic, obs: Float[Array, "batch obs"], noise: Float[Array, "batch action"]
+        self,
+        actor: Actor,
+        critic: Critic,
+        obs: Float[Array, "batch obs"],
+        noise: Float[Array, "batch action"],
+        alive: Float[Array, " batch"],
     ) -> Float[Array, ""]:
-        """Minus the smaller value of the actor's noisy action (deterministic policy gradient)."""
+        """Minus the smaller value of the actor's noisy action (deterministic policy gradient), where `alive` is 1."""
         first, second = critic(obs, perturb(actor(obs), noise))
-        return -jnp.mean(jnp.minimum(first, second))
+        return -jnp.mean(alive * jnp.minimum(first, second))
 
     def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
-        """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`."""
+        """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`; `a' = 0` in the absorbing one."""
         obs_n = window.obs[:, -1]
-        first, second = state.critic_target(obs_n, perturb(state.actor(obs_n), noise))
+        action = perturb(state.actor(_scaled(state.scaler, obs_n)), noise) * self._alive(obs_n)[:, None]
+        first, second = state.critic_target(_scaled(state.scaler, obs_n), action)
         return n_step_target(window.reward, window.discount, jnp.minimum(first, second), self.gamma)
 
-    def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
-        scaler = state.scaler and state.scaler.update(window.obs[:, 0])
-        if scaler is not None:
-            window = window._replace(obs=scaler(window.obs))
-        obs, action = window.obs[:, 0], window.action[:, 0]
-        noise = self.noise(step) * jax.random.normal(key, (2, *action.shape))
-        noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
+    def _alive(self, obs: Float[Array, "batch obs"]) -> Float[Array, " batch"]:
+        """0 in the absorbing state, 1 elsewhere."""
+        return 1 - obs[:, -1] if self.absorbing else jnp.ones(obs.shape[0])
 
+    def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
+        alive = self._alive(window.obs[:, 0])
+        noise = self.noise(step) * jax.random.normal(key, (2, *window.action[:, 0].shape))
+        noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
         target = jax.lax.stop_gradient(self.target(state, window, noise[0]))
+
+        scaler = state.scaler and state.scaler.update(window.obs[:, 0])
+        obs, action = _scaled(scaler, window.obs[:, 0]), window.action[:, 0]
         gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
         critic, critic_moments = adam_step(state.critic, gradient, state.critic_moments, self.learning_rate)
 
-        loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1])
+        loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1], alive)
         actor, actor_moments = adam_step(state.actor, gradient, state.actor_moments, self.learning_rate)
 
         critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
@@ -115,14 +125,22 @@ class DrQV2(Agent):
         return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments, scaler), metrics
 
     def actor(self, state: DrQV2State) -> Actor:
-        if state.scaler is None:
-            return state.actor
-        return eqx.tree_at(lambda actor: actor.trunk, state.actor, state.scaler.fold(state.actor.trunk))
+        return eqx.tree_at(lambda actor: actor.trunk, state.actor, self._plain(state.actor.trunk, state.scaler, self.absorbing))
 
-    def embed(self, state: DrQV2State, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch features"]:
-        return state.critic.trunk(obs if state.scaler is None else state.scaler(obs))
+    def trunk(self, state: DrQV2State, whose: Literal["critic", "actor"]) -> Trunk:
+        return self._plain(state.critic.trunk if whose == "critic" else state.actor.trunk, state.scaler, False)
+
+    @staticmethod
+    def _plain(trunk: Trunk, scaler: Scaler | None, drop_last: bool) -> Trunk:
+        """The trunk for plain observations; without the absorbing state's entry, which is 0 wherever a policy acts."""
+        trunk = trunk if scaler is None else scaler.fold(trunk)
+        return eqx.tree_at(lambda t: t.weight, trunk, trunk.weight[:-1]) if drop_last else trunk
 
     def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
         mean = actor(obs, np)
         noise = self.noise(step, np) * rng.standard_normal(mean.shape, dtype=np.float32)
         return perturb(mean, noise, np)
+
+
+def _scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
+    return obs if scaler is None else scaler(obs)

@@ -1,12 +1,15 @@
 """Adversarial imitation: a discriminator of expert and agent states, and DAC's reward, its logit.
 
-Kostrikov et al. 2019 in the form of the authors' code (agent/dac.py): the features of the critic's trunk go in, no actions.
+Kostrikov et al. 2019 in the form of the authors' code (agent/dac.py): the features of the critic's trunk go in, and actions
+only where they are asked for, as in the original.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -18,7 +21,7 @@ from pcil.losses import binary_cross_entropy, gradient_penalty, interpolate
 from pcil.networks import MLP
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.types import Batch
+from pcil.types import Batch, Window
 
 
 class DiscriminatorState(eqx.Module):
@@ -32,6 +35,8 @@ class DiscriminatorState(eqx.Module):
 class DAC(Reward):
     """Settings of DAC's reward: `log D - log(1 - D)`, which is the logit itself, so it is never computed by logarithms."""
 
+    inputs: Literal["state", "state-action"] = "state"
+    """What is told apart: the states that steps led to, or states with the actions taken in them."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the logit."""
     hidden: int = 256
@@ -43,16 +48,26 @@ class DAC(Reward):
         super().__post_init__()
         check_ranges(self, batch_size=(1, inf), penalty=(0, inf), hidden=(1, inf), learning_rate=(0, 1))
 
-    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
-        features = jax.eval_shape(embed, jnp.asarray(demos.obs)).shape[-1]
-        discriminator = MLP.init((features, self.hidden, self.hidden, 1), key=key)
+    @property
+    def reads(self) -> Literal["obs", "next_obs"]:
+        return "obs" if self.inputs == "state-action" else "next_obs"
+
+    def seen(
+        self, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"], embed: Embed
+    ) -> Float[Array, "batch inputs"]:
+        """What the discriminator is given for these steps."""
+        return jnp.concatenate([embed(obs), action], axis=-1) if self.inputs == "state-action" else embed(obs)
+
+    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
+        width = jax.eval_shape(lambda demo: self.seen(demo.obs, demo.action, embed), demos[0]).shape[-1]
+        discriminator = MLP.init((width, self.hidden, self.hidden, 1), key=key)
         return DiscriminatorState(discriminator, adam_init(discriminator))
 
     def loss(
         self,
         discriminator: MLP,
-        expert: Float[Array, "batch features"],
-        agent: Float[Array, "batch features"],
+        expert: Float[Array, "batch inputs"],
+        agent: Float[Array, "batch inputs"],
         *,
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, ""], Metrics]:
@@ -73,10 +88,10 @@ class DAC(Reward):
         return entropy + self.penalty * slope, metrics
 
     def update(
-        self, state: DiscriminatorState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
+        self, state: DiscriminatorState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[DiscriminatorState, Metrics]:
-        features = embed(jnp.asarray(expert.obs)), embed(jnp.asarray(agent.obs))
-        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *features, key=key)
+        seen = (self.seen(jnp.asarray(w.obs[:, 0]), jnp.asarray(w.action[:, 0]), embed) for w in (expert, agent))
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *seen, key=key)
         return DiscriminatorState(*adam_step(state.discriminator, gradient, state.moments, self.learning_rate)), metrics
 
     def reward(
@@ -88,5 +103,5 @@ class DAC(Reward):
         *,
         key: PRNGKeyArray,
     ) -> Float[Array, " T"]:
-        del action, key
-        return state.discriminator(embed(obs))[:, 0]
+        del key
+        return state.discriminator(self.seen(obs, action, embed))[:, 0]

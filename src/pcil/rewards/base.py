@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal
@@ -11,11 +11,11 @@ from typing import Any, ClassVar, Literal
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.types import Batch
+from pcil.types import Batch, Window
 
 Metrics = dict[str, Float[Array, ""]]
 Embed = Callable[[Float[Array, "*batch obs"]], Float[Array, "*batch features"]]
-"""The agent's features of an observation; no gradient flows through them."""
+"""The agent's features of an observation; no gradient flows through them. It is a pytree, so a state may keep it."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,10 @@ class Reward(abc.ABC):
     """An imitation reward: learned from demonstrations and from what the agent does.
 
     `scope` says what `reward` must be given: "step" for any steps in any order, "episode" for one whole episode in the order
-    of time. `reads` says which state of a step it is given: "next_obs", the state that the step led to, or "obs", the state
-    in which the action was taken (what a reward of state-action pairs needs). `needs_demos` is False where no
-    demonstrations are used at all.
+    of time. `needs_demos` is False where no demonstrations are used at all.
     """
 
     scope: ClassVar[Literal["step", "episode"]] = "step"
-    reads: ClassVar[Literal["obs", "next_obs"]] = "next_obs"
     needs_demos: ClassVar[bool] = True
 
     task_weight: float = 0.0
@@ -40,16 +37,37 @@ class Reward(abc.ABC):
     def __post_init__(self) -> None:
         check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf))
 
+    @property
+    def reads(self) -> Literal["obs", "next_obs"]:
+        """Which state of a step `reward` is given: the one that the step led to, or the one in which the action was taken,
+        which is what a reward of state-action pairs needs."""
+        return "next_obs"
+
+    @property
+    def features(self) -> Literal["critic", "actor"]:
+        """Whose trunk `embed` is."""
+        return "critic"
+
+    @property
+    def span(self) -> int:
+        """Least number of steps in the windows that `update` is given."""
+        return 1
+
+    @property
+    def prefill(self) -> tuple[int, float]:
+        """How many expert steps the replay begins with, and the reward stored for each of them."""
+        return 0, 0.0
+
     @abc.abstractmethod
-    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> Any:
-        """The state before the first update; `demos` are all expert states and actions in the order of time.
+    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> Any:
+        """The state before the first update; `demos` has the states and actions of each demonstration, in the order of time.
 
         It is compiled, so it computes with JAX.
         """
 
     @abc.abstractmethod
-    def update(self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:
-        """One gradient step on a batch of expert steps and one of agent steps."""
+    def update(self, state: Any, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        """One gradient step on `batch_size` windows of the expert and as many of the agent."""
 
     @abc.abstractmethod
     def reward(

@@ -6,6 +6,7 @@ authors' code.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from pcil.losses import gradient_penalty, info_nce, interpolate
 from pcil.networks import MLP, unit_sphere
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.types import Batch
+from pcil.types import Batch, Window
 
 
 class PCILState(eqx.Module):
@@ -67,10 +68,10 @@ class PCIL(Reward):
             self, temperature=(1e-6, inf), penalty=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf)
         )
 
-    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> PCILState:
+    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> PCILState:
         encoder_key, reference_key = jax.random.split(key)
-        rows = jax.random.randint(reference_key, (self.batch_size,), 0, demos.obs.shape[0])
-        reference = jnp.asarray(demos.obs)[rows]
+        states = jnp.concatenate([demo.obs for demo in demos])
+        reference = states[jax.random.randint(reference_key, (self.batch_size,), 0, states.shape[0])]
         features = jax.eval_shape(embed, reference).shape[-1]
         encoder = MLP.init((features, self.hidden, self.hidden, self.hidden, self.hidden // 4), key=encoder_key)
         return PCILState(encoder, adam_init(encoder), reference)
@@ -108,12 +109,13 @@ class PCIL(Reward):
         return contrast + self.penalty * slope, metrics
 
     def update(
-        self, state: PCILState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
+        self, state: PCILState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[PCILState, Metrics]:
-        features = [embed(jnp.asarray(obs)) for obs in (expert.obs, agent.obs, state.reference)]
+        states = jnp.asarray(expert.obs[:, 0])
+        features = [embed(obs) for obs in (states, jnp.asarray(agent.obs[:, 0]), state.reference)]
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, key=key)
         encoder, moments = adam_step(state.encoder, gradient, state.moments, self.learning_rate)
-        return PCILState(encoder, moments, jnp.asarray(expert.obs)), metrics
+        return PCILState(encoder, moments, states), metrics
 
     def reward(
         self, state: PCILState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.types import Batch
+from pcil.types import Batch, Window
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,10 @@ class TaskReward(Reward):
     batch_size: int = 0
     """No expert steps are drawn."""
 
-    def init(self, demos: Batch, embed: Embed, *, key: PRNGKeyArray) -> None:
+    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> None:
         del demos, embed, key
 
-    def update(self, state: None, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[None, Metrics]:
+    def update(self, state: None, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray) -> tuple[None, Metrics]:
         del state, expert, agent, embed, key
         return None, {}
 

@@ -1,0 +1,78 @@
+"""Behavioural cloning: the actor of DrQ-v2, fitted to the expert's actions (paper section 4.1; authors' code: agent/bc.py)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, log, pi
+from typing import ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.agents.base import Agent, Metrics
+from pcil.errors import check_ranges
+from pcil.networks import Actor, Trunk
+from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.types import Spec, Window
+
+
+class BCState(eqx.Module):
+    """The actor and its optimiser's moments."""
+
+    actor: Actor
+    moments: Moments
+
+
+@dataclass(frozen=True)
+class BC(Agent):
+    """Settings of behavioural cloning."""
+
+    offline: ClassVar[bool] = True
+
+    n_step: int = 1
+    """Steps in a window; only the first is used."""
+    learning_rate: float = 1e-4
+    """Adam's."""
+    deviation: float = 0.1
+    """Standard deviation of the Gaussian around the actor's mean action."""
+    feature_dim: int = 50
+    """Width of the trunk."""
+    hidden: int = 256
+    """Width of the two hidden layers."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self, learning_rate=(0, 1), deviation=(1e-6, inf), feature_dim=(1, inf), hidden=(1, inf))
+
+    def init(self, spec: Spec, *, key: PRNGKeyArray) -> BCState:
+        actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=key)
+        return BCState(actor, adam_init(actor))
+
+    def loss(
+        self, actor: Actor, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"]
+    ) -> tuple[Float[Array, ""], Metrics]:
+        """`-sum_d log N(a_d; mu_d(s), deviation)`, averaged over the batch: the squared error over twice the variance, and a
+        constant."""
+        error = jnp.mean(jnp.sum((actor(obs) - action) ** 2, axis=-1))
+        constant = action.shape[-1] * (log(self.deviation) + log(2 * pi) / 2)
+        return error / (2 * self.deviation**2) + constant, {"squared_error": error}
+
+    def update(self, state: BCState, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[BCState, Metrics]:
+        del step, key
+        gradient_of = jax.value_and_grad(self.loss, has_aux=True)
+        (loss, metrics), gradient = gradient_of(state.actor, window.obs[:, 0], window.action[:, 0])
+        return BCState(*adam_step(state.actor, gradient, state.moments, self.learning_rate)), {"loss": loss, **metrics}
+
+    def actor(self, state: BCState) -> Actor:
+        return state.actor
+
+    def trunk(self, state: BCState, whose: Literal["critic", "actor"]) -> Trunk:
+        del whose
+        return state.actor.trunk
+
+    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
+        del step, rng
+        return actor(obs, np)

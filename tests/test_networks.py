@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
@@ -14,11 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcil.networks import LAYER_NORM_EPSILON, MLP, Actor, Critic, Trunk, unit_sphere
+from pcil.networks import LAYER_NORM_EPSILON, MLP, SCALER_FLOOR, SCALER_RATE, Actor, Critic, Scaler, Trunk, unit_sphere
 from pcil.noise import ACTION_MARGIN, LinearSchedule, perturb
 from pcil.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=50)
+scaler_update = jax.jit(Scaler.update)
 OBS_DIM, ACTION_DIM, FEATURES, HIDDEN = 5, 3, 8, 16
 
 
@@ -249,3 +251,40 @@ def test_the_first_step_of_adam_is_the_learning_rate_against_the_gradient() -> N
     moved, _ = adam_step(network, gradient, adam_init(network), 1e-3)
     for before, after in zip(jax.tree.leaves(network), jax.tree.leaves(moved), strict=True):
         np.testing.assert_allclose(np.asarray(after - before), -1e-3, rtol=1e-3)
+
+
+# --- Standardised observations ---
+
+
+@law
+@given(st.integers(0, 2**32), st.integers(1, 30))
+def test_the_scalers_statistics_are_those_of_all_rows_seen(seed: int, batches: int) -> None:
+    """As long as fewer batches were seen than the least rate allows, against NumPy over the rows together."""
+    rng = np.random.default_rng(seed)
+    rows = (rng.normal(size=(batches, 8, 3)) * [1, 10, 0.1] + [0, -20, 5]).astype(np.float32)
+    scaler = Scaler.init(3)
+    for batch in rows:
+        scaler = scaler_update(scaler, batch)
+    flat = rows.reshape(-1, 3).astype(np.float64)
+    assert np.allclose(scaler.mean, flat.mean(axis=0), rtol=1e-4, atol=1e-4)
+    assert np.allclose(scaler.variance, flat.var(axis=0), rtol=1e-3, atol=1e-5)
+
+
+def test_the_scaler_forgets_what_is_long_past() -> None:
+    scaler = dataclasses.replace(Scaler.init(1), count=jnp.float32(1e6))
+    for _ in range(20):
+        scaler = scaler_update(scaler, np.full((8, 1), 3.0, np.float32))
+    assert float(scaler.mean[0]) == pytest.approx(3 * (1 - (1 - SCALER_RATE) ** 20), rel=1e-3)
+
+
+@law
+@given(st.integers(0, 2**32))
+def test_a_folded_trunk_gives_for_plain_observations_what_the_trunk_gives_for_scaled_ones(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    trunk = randomised(Trunk.init(4, FEATURES, key=jax.random.key(0)), seed)
+    mean, variance = rng.normal(size=4) * 10, rng.uniform(0, 9, size=4)
+    scaler = Scaler(*(jnp.asarray(x, jnp.float32) for x in (mean, variance, 5.0)))
+    obs = (rng.normal(size=(6, 4)) * 3 + mean).astype(np.float32)
+    naive = (obs - mean) / np.sqrt(variance + SCALER_FLOOR**2)
+    assert np.allclose(scaler.fold(trunk)(jnp.asarray(obs)), trunk(jnp.asarray(naive, jnp.float32)), atol=2e-3)
+    assert np.allclose(scaler(jnp.asarray(obs)), naive, rtol=1e-3, atol=1e-3)

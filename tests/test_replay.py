@@ -67,9 +67,10 @@ def check(window: Window, expected: dict, batch: int, n: int) -> list[float]:
     """Every row is one of the enumerated windows, exactly; returns which."""
     assert window.obs.shape == (batch, n + 1, 2) and window.action.shape == (batch, n, 1)
     assert window.reward.shape == window.discount.shape == (batch, n)
-    assert all(array.dtype == np.float32 for array in window)
+    assert all(array.dtype == np.float32 for array in window[:4]) and window.number.dtype == np.int32
     rows = zip(*(array.tolist() for array in window), strict=True)
-    for obs, action, reward, discount in rows:
+    for obs, action, reward, discount, number in rows:
+        assert number == obs[0][0] // 1000, "episodes are named in the order in which they are added"
         true_obs, true_action, true_reward, true_discount = expected[obs[0][0]]
         assert obs == true_obs
         assert action == true_action
@@ -240,7 +241,7 @@ def test_an_empty_replay_has_no_window() -> None:
 def test_writing_into_a_window_changes_no_row() -> None:
     replay, naive = fill(20, (5, True), (6, False))
     for array in replay.sample(np.random.default_rng(0), 50, 3):
-        array[:] = np.nan
+        array[:] = -1
     for array in replay.state().values():
         array[...] = 0
     check(replay.sample(np.random.default_rng(0), 50, 3), naive.windows(3), 50, 3)
@@ -287,8 +288,9 @@ def test_a_state_holds_the_rows_in_use_and_no_others() -> None:
         "obs": (13, 2),
         "action": (13, 1),
         "reward": (13,),
-        "segments": (2, 3),
+        "segments": (2, 4),
         "next": (),
+        "added": (),
     }
 
 

@@ -123,7 +123,7 @@ def code_words(path: Path) -> Iterator[tuple[int, str]]:
             yield line, token.string.lower()
 
 
-GENERAL = [PACKAGE / name for name in ("loop.py", "learner.py", "evaluate.py")] + sorted((PACKAGE / "agents").glob("*.py"))
+GENERAL = [PACKAGE / name for name in ("loop.py", "learner.py", "evaluate.py", "agents/base.py", "agents/drqv2.py")]
 
 
 @pytest.mark.parametrize("path", GENERAL, ids=lambda path: path.stem)

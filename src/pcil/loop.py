@@ -246,6 +246,7 @@ def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
     """Everything that the rest of the run depends on; a finished run needs no replay."""
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
+    arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
     if counters.final_return is None:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
     meta = {"counters": asdict(counters), "positions": log.positions()}
@@ -264,8 +265,9 @@ def _resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[S
     if counters.final_return is None:
         fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
         reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    actor = jax.tree.map(jnp.copy, run.agent.actor(restored.agent))
-    return State(restored, actor, fresh.replay, fresh.expert, counters), meta["positions"]
+    return State(restored, checkpoint.unflatten("actor", fresh.actor, arrays), fresh.replay, fresh.expert, counters), meta[
+        "positions"
+    ]
 
 
 class _Clock:

@@ -134,3 +134,45 @@ def optimal_return(env: gymnasium.Env, seed: int) -> float:
         obs, reward, _, over, _ = env.step(PointMass.optimal_action(obs).astype(np.float32))
         total += float(reward)
     return total
+
+
+# --- Standardised observations, absorbing states ---
+
+
+def test_the_actor_that_leaves_acts_on_plain_observations() -> None:
+    """Large units, far from zero: what acts is the network on standardised observations, its scale folded in."""
+    agent = dataclasses.replace(AGENT, standardise=True)
+    state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
+    window = window._replace(obs=window.obs * jnp.array([[[1.0, 30.0, 0.01]]]) + jnp.array([[[0.0, -50.0, 2.0]]]))
+    update = jax.jit(lambda s, k: agent.update(s, window, step=jnp.int32(0), key=k)[0])
+    for i in range(5):
+        state = update(state, jax.random.key(i))
+    assert state.scaler is not None
+    flat = np.asarray(window.obs[:, 0], np.float64)
+    scaled = ((flat - flat.mean(axis=0)) / np.sqrt(flat.var(axis=0) + 1e-4)).astype(np.float32)
+    assert np.allclose(agent.actor(state)(window.obs[:, 0]), state.actor(jnp.asarray(scaled)), atol=1e-3)
+    assert np.allclose(agent.trunk(state, "critic")(window.obs[:, 0]), state.critic.trunk(jnp.asarray(scaled)), atol=1e-3)
+
+
+ABSORBING = dataclasses.replace(AGENT, absorbing=True)
+
+
+def test_the_action_in_the_absorbing_state_is_zero_in_targets() -> None:
+    state, window = ABSORBING.init(SPEC, key=jax.random.key(0)), make_window()
+    window = window._replace(obs=window.obs.at[:, :, -1].set(0.0).at[0, 3].set(jnp.array([0.0, 0.0, 1.0])))
+    got = ABSORBING.target(state, window, jnp.full((32, 2), 0.2))
+    for row, action in ((0, jnp.zeros(2)), (1, state.actor(window.obs[1, 3]) + 0.2)):
+        values = state.critic_target(window.obs[row, 3], action)
+        rewards = sum(AGENT.gamma**k * float(window.reward[row, k]) for k in range(3))
+        assert got[row] == pytest.approx(rewards + AGENT.gamma**3 * float(min(values)), abs=1e-5)
+
+
+def test_the_actor_is_not_trained_in_the_absorbing_state_and_leaves_without_its_entry() -> None:
+    state, window = ABSORBING.init(SPEC, key=jax.random.key(0)), make_window()
+    window = window._replace(obs=jnp.zeros_like(window.obs).at[:, :, -1].set(1.0))
+    after, _ = ABSORBING.update(state, window, step=jnp.int32(0), key=jax.random.key(1))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after.actor), jax.tree.leaves(state.actor), strict=True))
+    assert not np.array_equal(after.critic.trunk.bias, state.critic.trunk.bias)
+    obs = random_batch(5, 2, 2).obs
+    padded = np.pad(obs, ((0, 0), (0, 1)))
+    assert np.allclose(ABSORBING.actor(state)(jnp.asarray(obs)), state.actor(jnp.asarray(padded)), atol=1e-6)

@@ -1,0 +1,101 @@
+"""Survival bias, and that absorbing states remove it: an environment that ends early, and a reward that says nothing.
+
+Kostrikov et al. 2019, section 4.2: where every step pays the same, an agent that counts an end as worth 0 clings to life (or
+flees it, if the pay is negative), whatever the demonstrations show.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pcil import envs, loop, runs
+from pcil.agents import DrQV2
+from pcil.policy import Policy
+from pcil.rewards import Reward
+from small import narrow, small_run
+
+GAMMA = 0.9
+EXIT = "pcil_test/exit-v0"
+
+
+class Exit(gymnasium.Env):
+    """Nothing ever changes, and an action above 0 ends the episode; it is cut after 20 steps."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        return np.zeros(1, np.float32), 0.0, bool(action[0] > 0), False, {}
+
+
+@dataclass(frozen=True)
+class Constant(Reward):
+    """Every step pays the same: no demonstration of an early end, and none of survival."""
+
+    needs_demos: ClassVar[bool] = False
+    batch_size: int = 0
+    pay: float = 1.0
+
+    def init(self, demos: Any, embed: Any, *, key: Any) -> None: ...
+
+    def update(self, state: Any, expert: Any, agent: Any, embed: Any, *, key: Any) -> Any:
+        return state, {}
+
+    def reward(self, state: Any, obs: Any, action: Any, embed: Any, *, key: Any) -> Any:
+        return jnp.full(obs.shape[0], self.pay)
+
+
+@pytest.fixture(autouse=True)
+def _registered() -> Any:
+    gymnasium.register(EXIT, Exit, max_episode_steps=20)
+    yield
+    del gymnasium.registry[EXIT]
+
+
+def trained(pay: float, absorbing: bool, folder: Path) -> loop.State:
+    """Uniform actions throughout, so that both kinds of action are seen whatever the agent would like."""
+    agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=1, absorbing=absorbing)
+    changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
+    run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=Constant(pay=pay))
+    folder.mkdir()
+    return loop.train_loop(run, folder, (), runs.Silent())
+
+
+def value(state: loop.State, action: float, absorbing: bool) -> float:
+    obs = jnp.zeros((1, 2 if absorbing else 1))
+    return float(np.min([q[0] for q in state.learner.agent.critic(obs, jnp.full((1, 1), action))]))
+
+
+@pytest.mark.parametrize("pay", [1.0, -1.0])
+def test_without_absorbing_states_an_end_is_worth_nothing(pay: float, tmp_path: Path) -> None:
+    """To stay is worth `pay / (1 - gamma)` if that is good, else one more step; to leave, one step's pay."""
+    state = trained(pay, False, tmp_path / "run")
+    stay = pay / (1 - GAMMA) if pay > 0 else pay + GAMMA * pay
+    assert value(state, 0.9, False) == pytest.approx(pay, abs=0.3)
+    assert value(state, -0.9, False) == pytest.approx(stay, rel=0.15)
+
+
+@pytest.mark.parametrize("pay", [1.0, -1.0])
+def test_with_absorbing_states_an_end_is_worth_what_every_other_state_is(pay: float, tmp_path: Path) -> None:
+    state = trained(pay, True, tmp_path / "run")
+    for action in (0.9, -0.9):
+        assert value(state, action, True) == pytest.approx(pay / (1 - GAMMA), rel=0.15)
+
+
+def test_the_policy_of_an_absorbing_run_takes_the_environments_own_observations(tmp_path: Path) -> None:
+    trained(1.0, True, tmp_path / "run")
+    policy: Policy = runs.load_policy(tmp_path / "run")
+    assert policy.spec.obs_dim == envs.spec(envs.make(EXIT)).obs_dim == 1
+    assert policy(np.zeros(1, np.float32)).shape == (1,)

@@ -71,7 +71,7 @@ def default(task: str) -> dict[str, Any]:
         "evaluate_episodes": 10,  # paper Figure 3
         "agent": DrQV2(
             batch_size=128,  # paper Table
-            n_step=3,  # DrQ-v2
+            n_step=1,  # ours
             learning_rate=5e-4,  # ours
             standardise=True,  # ours: experts learn several times faster
             noise=LinearSchedule(1.0, 0.1, 30_000),  # ours

@@ -238,6 +238,40 @@ def _record(words: list[str]) -> int:
     return arguments.call("record", record, words)
 
 
+def _theory(words: list[str]) -> int:
+    """Check the paper's Theorem 1 numerically, and draw it."""
+
+    import tyro
+
+    def check(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+        """Check the paper's Theorem 1 numerically, and draw it.
+
+        Args:
+            out: Folder of theory.png and theory.pdf; by default the current one, or no figure with --json.
+            seed: The random pairs follow from it.
+            json_output: Print one JSON object and nothing else.
+        """
+        from pcil import theory
+
+        _at_least(0, seed=seed)
+        pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
+        figures = theory.measure(pairs)
+        drawn = ""
+        if out is not None or not json_output:
+            try:
+                from pcil.report.theory import draw
+            except ImportError:
+                drawn = "No figure is drawn without matplotlib; pip install 'pcil[report]' brings it."
+            else:
+                drawn = f"Figure: {draw(pairs, out or Path())}"
+        print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")
+        if json_output and drawn:
+            print(drawn, file=sys.stderr)
+        return 0
+
+    return arguments.call("theory", check, words)
+
+
 def _bench(words: list[str]) -> int:
     """Measure the speed of each part, and its ratio to the floor."""
 
@@ -301,6 +335,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "evaluate": _evaluate,
     "demos": _demos,
     "record": _record,
+    "theory": _theory,
     "bench": _bench,
     "doctor": _doctor,
 }

@@ -12,10 +12,12 @@ from typing import Any
 from pcil import demos, envs, runs
 from pcil.errors import InputError
 from pcil.policy import load_policy
+from pcil.report.load import read_run, write_points
 
 HERE = Path(__file__).parent
 RUNS = Path("runs/experts")
 POLICIES = demos.SHIPPED.parent / "policies"
+RESULTS = HERE.parent / "results" / "experts"
 EPISODES = 10
 
 
@@ -25,7 +27,9 @@ def main(wanted: list[str]) -> None:
     for task in wanted or plan:
         if task not in plan:
             raise InputError(f"experts.toml has no {task}; it has {', '.join(plan)}.")
-        ship(task, best(task, dict(plan[task])), len(plan[task]["seeds"]))
+        settings = dict(plan[task])
+        tries = settings.pop("tries")
+        ship(task, best(task, settings), tries)
 
 
 def best(task: str, settings: dict[str, Any]) -> Path:
@@ -42,16 +46,17 @@ def best(task: str, settings: dict[str, Any]) -> Path:
     return max(finished, key=lambda folder: finished[folder])
 
 
-def ship(task: str, folder: Path, seeds_tried: int) -> None:
-    """Ten deterministic episodes and the policy into the package, in place of what was there."""
+def ship(task: str, folder: Path, tries: int) -> None:
+    """Ten deterministic episodes and the policy into the package, in place of what was there, and its curve into results."""
     policy = load_policy(folder)
     command = f"python experiments/experts.py {task}"
-    info = runs.provenance(folder, policy, command) | {"seeds_tried": seeds_tried}
+    info = runs.provenance(folder, policy, command) | {"seeds_tried": tries}
     recorded = demos.record(policy, envs.make(task), EPISODES, task=task, seed=0, info=info)
     target = demos.SHIPPED / "dmc" / task / "expert-v0"
     shutil.rmtree(target, ignore_errors=True)
     recorded.save(target)
     policy.save(POLICIES / task)
+    write_points(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
 
 

@@ -323,6 +323,18 @@ def test_true_equals_a_search_of_the_plane() -> None:
     assert np.all(best <= values + EXACT) and np.all(values <= np.array(best) + 0.001)
 
 
+def test_the_best_of_the_starts_counts_even_if_it_has_not_arrived() -> None:
+    """Without a sweep the starts differ; what is returned is the best of them with its own embedding."""
+    p, q = (weights[0] for weights in random_weights(6, 1))
+    values = []
+    for restarts in (4, 64, 2048):
+        value, phi = theory.attained(p, q, restarts=restarts, sweeps=0)
+        assert theory.objective(phi, p, q) == pytest.approx(value, abs=EXACT)
+        values.append(float(value))
+    assert values[0] <= values[1] <= values[2] < theory.attained(p, q)[0], "the first starts are the same"
+    assert values[0] < values[2]
+
+
 def test_many_pairs_at_once_are_as_one_by_one() -> None:
     p, q = random_weights(4, 6)
     for function in (theory.total_variation, theory.expert_mass, lambda p, q: theory.relaxed(p, q)[0]):

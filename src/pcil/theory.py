@@ -94,10 +94,10 @@ def attained(p: Weights, q: Weights, *, restarts: int = 4, sweeps: int = 1000, s
     phi = np.random.default_rng(seed).standard_normal((*p.shape[:-3], restarts, p.shape[-2], 4))
     phi /= np.linalg.norm(phi, axis=-1, keepdims=True)
     value = np.full(phi.shape[:-2], -np.inf)
-    for _ in range(sweeps):
+    for sweep in range(sweeps + 1):
         before, v, u = value, (p * phi).sum(axis=-2), (d * phi).sum(axis=-2)
         value = (v * u).sum(axis=-1)
-        if np.max(value - before) < 1e-14:
+        if sweep == sweeps or np.max(value - before) < 1e-14:
             break
         for i in range(p.shape[-2]):
             p_i, d_i, own = p[..., i, :], d[..., i, :], phi[..., i, :]

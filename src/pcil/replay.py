@@ -41,7 +41,7 @@ class Replay:
         self._segments: deque[Segment] = deque()
         self._next = 0
         self._added = 0
-        self._index: tuple[int, np.ndarray, np.ndarray] | None = None
+        self._index: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     @classmethod
     def of(cls, episodes: Sequence[Episode]) -> Replay:
@@ -88,7 +88,7 @@ class Replay:
         self._segments.append(Segment(self._next, len(episode), episode.terminated, self._added))
         self._added += 1
         self._next = (self._next + rows) % self.capacity
-        self._index = None
+        self._index = {}
 
     def sample(self, rng: np.random.Generator, batch: int, n: int) -> Window:
         """`batch` windows of `n` steps, uniform over all valid starts, with replacement.
@@ -136,16 +136,16 @@ class Replay:
         first = self._segments[0].start if self._segments else self._next
         index = (first + np.arange(len(state["obs"]))) % self.capacity
         self._obs[index], self._action[index], self._reward[index] = state["obs"], state["action"], state["reward"]
-        self._index = None
+        self._index = {}
 
     def _free(self) -> int:
         return self.capacity - sum(segment.length + 1 for segment in self._segments)
 
     def _starts(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """A row `(start, length, terminated, number, valid starts before)` an episode, and the total of valid starts."""
-        if self._index is None or self._index[0] != n:
+        if n not in self._index:
             counts = np.array([segment.starts(n) for segment in self._segments], np.int64)
             cumulative = np.cumsum(counts)
             table = np.array(self._segments, np.int64).reshape(-1, 4)
-            self._index = n, np.column_stack([table, cumulative - counts]), cumulative
-        return self._index[1], self._index[2]
+            self._index[n] = np.column_stack([table, cumulative - counts]), cumulative
+        return self._index[n]

@@ -68,12 +68,22 @@ def finish(run: Run, folder: Path, stops: tuple[int, ...] = ()) -> None:
     runs.execute(run, folder, runs.Silent())
 
 
-CASES = [("pcil", "sampled"), ("pcil", "stored"), ("dac", "sampled"), ("expert", "stored")]
+CASES = [
+    ("pcil", "sampled", {}),
+    ("pcil", "stored", {}),
+    ("dac", "sampled", {}),
+    ("expert", "stored", {}),
+    ("tcn", "sampled", {"negatives": "rollout", "margin": 5}),  # windows of its own, of ten steps
+    ("pcil-gail", "stored", {"penalty_every": 3, "stages": 2}),
+    ("tcn-gail", "sampled", {}),
+]
 
 
-@pytest.mark.parametrize(("method", "label"), CASES)
-def test_a_stopped_run_equals_an_uninterrupted_one(method: str, label: str, demos: str, tmp_path: Path) -> None:
-    run = small_run(method, label=label, demos=demos)
+@pytest.mark.parametrize(("method", "label", "reward"), CASES)
+def test_a_stopped_run_equals_an_uninterrupted_one(
+    method: str, label: str, reward: dict[str, Any], demos: str, tmp_path: Path
+) -> None:
+    run = small_run(method, label=label, demos=demos, reward=reward)
     finish(run, tmp_path / "whole")
     finish(run, tmp_path / "stopped", stops=(1, 2, 1))
     same_run(tmp_path / "whole", tmp_path / "stopped")

@@ -20,6 +20,7 @@ law = settings(deadline=None, derandomize=True, max_examples=30)
 info_nce = jax.jit(losses.info_nce, static_argnums=3)
 info_nce_slopes = jax.jit(jax.grad(losses.info_nce, (1, 2), has_aux=True), static_argnums=3)
 gradient_penalty = jax.jit(losses.gradient_penalty, static_argnums=0)
+group_info_nce = jax.jit(losses.group_info_nce, static_argnums=3)
 interpolate = jax.jit(losses.interpolate)
 binary_cross_entropy = jax.jit(losses.binary_cross_entropy)
 n_step_target = jax.jit(losses.n_step_target, static_argnums=3)
@@ -154,6 +155,60 @@ def test_info_nce_has_the_derivative_that_differences_show() -> None:
         rows = tuple(jnp.asarray(unit_rows(rng, n, 4)) for n in (3, 3, 5))
         assert info_nce(*rows, 0.5)[0].dtype == jnp.float64
         jax.test_util.check_grads(lambda *r: info_nce(*r, 0.5)[0], rows, order=1)
+
+
+def naive_group_info_nce(rows: np.ndarray, group: np.ndarray, others: np.ndarray, temperature: float) -> float:
+    """Anchor by anchor, positive by positive, each with the negatives that it alone stands against."""
+    of_anchors = []
+    for i, anchor in enumerate(rows):
+        negatives = np.concatenate([rows[group != group[i]], others])
+        partners = [j for j in range(len(rows)) if j != i and group[j] == group[i]]
+        costs = [naive_info_nce(anchor[None], rows[j][None], negatives, temperature) for j in partners]
+        of_anchors.append(sum(costs) / len(costs) if costs else 0.0)
+    return sum(of_anchors) / len(of_anchors)
+
+
+@law
+@given(st.integers(0, 2**32), st.integers(1, 4), st.sampled_from([0.07, 1.0]))
+def test_the_loss_of_groups_equals_a_naive_one(seed: int, groups: int, temperature: float) -> None:
+    rng = np.random.default_rng(seed)
+    rows, group, others = unit_rows(rng, 6, 3), rng.integers(groups, size=6), unit_rows(rng, 4, 3)
+    with jax.enable_x64(True):
+        loss = group_info_nce(jnp.asarray(rows), jnp.asarray(group), jnp.asarray(others), temperature)
+    assert float(loss) == pytest.approx(naive_group_info_nce(rows, group, others, temperature), rel=1e-9, abs=1e-12)
+
+
+def test_the_loss_of_groups_by_hand() -> None:
+    """Two rows at (1, 0) in one group, one at (0, 1) alone in another, one other row at (-1, 0); temperature 1.
+
+    Each of the two: positive 1, negatives 0 and -1, so -1 + log(e + 1 + 1/e) = 0.407606. The third adds 0; the mean is
+    0.271737.
+    """
+    rows = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+    loss = group_info_nce(rows, jnp.array([7, 2, 7]), jnp.array([[-1.0, 0.0]]), 1.0)
+    assert float(loss) == pytest.approx(0.271737, abs=1e-6)
+
+
+def test_with_one_group_it_is_info_nce_averaged_over_all_partners() -> None:
+    rng = np.random.default_rng(0)
+    rows, others = (jnp.asarray(unit_rows(rng, n, 3), jnp.float32) for n in (5, 4))
+    by_shift = [float(info_nce(rows, jnp.roll(rows, shift, axis=0), others, 0.5)[0]) for shift in range(1, 5)]
+    loss = group_info_nce(rows, jnp.zeros(5, jnp.int32), others, 0.5)
+    assert float(loss) == pytest.approx(np.mean(by_shift), rel=1e-6)
+
+
+def test_the_loss_of_groups_has_the_derivative_that_differences_show_and_no_infinite_one() -> None:
+    rng, group = np.random.default_rng(0), jnp.array([0, 1, 0, 1, 2])
+    with jax.enable_x64(True):
+        rows, others = (jnp.asarray(unit_rows(rng, n, 3)) for n in (5, 4))
+        jax.test_util.check_grads(lambda r, o: group_info_nce(r, group, o, 0.5), (rows, others), order=1)
+    sharp = jax.grad(lambda r: group_info_nce(r, group, -r, 1e-4))(jnp.tile(circle(1.0), (5, 1)))
+    assert np.isfinite(sharp).all()
+
+
+def test_off_the_diagonal_is_all_but_the_diagonal() -> None:
+    square = jnp.arange(16.0).reshape(4, 4)
+    assert losses.off_diagonal(square).tolist() == [[1, 2, 3], [4, 6, 7], [8, 9, 11], [12, 13, 14]]
 
 
 # --- The gradient penalty ---

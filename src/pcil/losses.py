@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 def info_nce(
@@ -25,8 +25,13 @@ def info_nce(
     minus. With all similarities equal the loss is `log(1 + negatives)`; it is never negative. Beside the loss come the mean
     positive and negative cosine and the share of anchors whose positive is nearer than every negative.
     """
-    cosine_positive = jnp.sum(anchor * positive, axis=-1)
-    cosine_negative = anchor @ negatives.T
+    return contrast(jnp.sum(anchor * positive, axis=-1), anchor @ negatives.T, temperature)
+
+
+def contrast(
+    cosine_positive: Float[Array, " batch"], cosine_negative: Float[Array, "batch negatives"], temperature: float
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """InfoNCE and its diagnostics from each anchor's cosines, whoever its negatives are."""
     logits = jnp.concatenate([cosine_positive[:, None], cosine_negative], axis=-1) / temperature
     loss = jnp.mean(jax.nn.logsumexp(logits, axis=-1) - logits[:, 0])
     diagnostics = {
@@ -35,6 +40,35 @@ def info_nce(
         "accuracy": jnp.mean(cosine_positive > jnp.max(cosine_negative, axis=-1), dtype=jnp.float32),
     }
     return loss, diagnostics
+
+
+def off_diagonal(square: Float[Array, "n n"]) -> Float[Array, "n others"]:
+    """Each row without its diagonal entry."""
+    n = len(square)
+    return square.ravel()[1:].reshape(n - 1, n + 1)[:, :-1].reshape(n, n - 1)  # the diagonal is every (n + 1)-th entry
+
+
+def group_info_nce(
+    rows: Float[Array, "batch dim"],
+    group: Int[Array, " batch"],
+    others: Float[Array, "others dim"],
+    temperature: float,
+) -> Float[Array, ""]:
+    """InfoNCE with every row as anchor: each other row of its group is a positive, rows of other groups and `others` negatives.
+
+    For anchor `i`, `s` as in `info_nce` and the negatives `n` of `i`, a positive `p` costs
+
+        -log( exp s(i, p) / (exp s(i, p) + sum_n exp s(i, n)) )  =  softplus( log sum_n exp s(i, n) - s(i, p) )
+
+    and the loss is the mean over the anchors of the mean over their positives. A row alone in its group adds 0.
+    """
+    same = group[:, None] == group[None, :]
+    positive = same & ~jnp.eye(len(rows), dtype=bool)
+    within = rows @ rows.T / temperature
+    negatives = jnp.concatenate([jnp.where(same, -jnp.inf, within), rows @ others.T / temperature], axis=1)
+    costs = jax.nn.softplus(jax.nn.logsumexp(negatives, axis=1, keepdims=True) - within)
+    num_positives = jnp.sum(positive, axis=1, dtype=costs.dtype)
+    return jnp.mean(jnp.sum(costs, axis=1, where=positive) / jnp.maximum(num_positives, 1))
 
 
 def gradient_penalty(

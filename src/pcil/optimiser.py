@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import jax
 import optax
+from jaxtyping import Array, Int
 
 Network = TypeVar("Network")
 Moments = Any
@@ -23,3 +24,8 @@ def adam_step(network: Network, gradient: Any, moments: Moments, learning_rate: 
         change, moments = optax.adam(learning_rate).update(gradient, moments)
     moved: Any = optax.apply_updates(network, change)  # pyright: ignore[reportArgumentType]
     return moved, moments
+
+
+def adam_count(moments: Moments) -> Int[Array, ""]:
+    """How many steps were taken with these moments."""
+    return optax.tree.get(moments, "count")

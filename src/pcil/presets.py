@@ -14,7 +14,7 @@ from pcil.agents import BC, DrQV2
 from pcil.config import Run, changed
 from pcil.errors import InputError
 from pcil.noise import LinearSchedule
-from pcil.rewards import DAC, PCIL, TaskReward
+from pcil.rewards import DAC, PCIL, TCN, TaskReward
 
 
 def paper(task: str) -> dict[str, Any]:
@@ -96,6 +96,15 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("dac", "paper"): {"reward": DAC()},  # authors' agent/dac.py
     ("dac", "released"): {"reward": DAC(hidden=1024)},  # authors' agent/dac.py, dmc.yaml
     ("dac", "default"): {"reward": DAC(learning_rate=5e-4)},  # ours
+    ("tcn", "paper"): {"reward": TCN(temperature=0.07)},  # paper Appendix C
+    ("tcn", "released"): {"reward": TCN(temperature=0.07, hidden=1024)},  # not in the release: Appendix C; size of dmc.yaml
+    ("tcn", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4)},  # Appendix C; rate: ours
+    ("pcil-gail", "paper"): {"reward": PCIL(temperature=0.07, head="gail")},  # paper Appendix C
+    ("pcil-gail", "released"): {"reward": PCIL(temperature=1.0, hidden=1024, head="gail")},  # head not in the release; as pcil
+    ("pcil-gail", "default"): {"reward": PCIL(temperature=1.0, learning_rate=5e-4, head="gail")},  # as pcil
+    ("tcn-gail", "paper"): {"reward": TCN(temperature=0.07, head="gail")},  # paper Appendix C
+    ("tcn-gail", "released"): {"reward": TCN(temperature=0.07, hidden=1024, head="gail")},  # not in the release; as tcn
+    ("tcn-gail", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4, head="gail")},  # as tcn
     ("bc", "paper"): {**BC_SETTINGS, "agent": BC()},  # authors' agent/bc.py; width of the paper's Table
     ("bc", "released"): {**BC_SETTINGS, "agent": BC(hidden=1024)},  # authors' agent/bc.py, dmc.yaml
     ("bc", "default"): {**BC_SETTINGS, "agent": BC()},  # as paper

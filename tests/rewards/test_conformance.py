@@ -1,7 +1,8 @@
-"""What every reward must do; one that is listed in `REWARDS` is tested by being listed."""
+"""What every reward must do; the reward of every method in `presets.METHODS` is tested by being there."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import checkpoint
+from pcil import checkpoint, presets
 from pcil.networks import Trunk
 from pcil.rewards import REWARDS, Reward, label
 from pcil.types import Batch, Window
@@ -26,26 +27,43 @@ AGENT = Batch(random_batch(200, 4, 2, seed=2).obs * 0.3 - 1.0, random_batch(200,
 DEMOS = [Batch(EXPERT.obs[i : i + 100], EXPERT.action[i : i + 100]) for i in (0, 100)]
 
 
+RUNS = [presets.make("walker_walk", method) for method in presets.METHODS]
+KINDS = {(type(run.reward), getattr(run.reward, "head", "")): run for run in RUNS}
+"""A run of each class of reward and, where it has heads, of each head."""
+CASES = {run.method: narrow(run.reward, learning_rate=3e-3) for run in KINDS.values()}
+CASES |= {
+    "pcil-stages": dataclasses.replace(CASES["pcil"], stages=3),
+    "pcil-lazy": dataclasses.replace(CASES["pcil"], penalty_every=4),
+}
+
+
 def rows(batch: Batch, start: int, size: int, span: int = 1) -> Window:
-    """`size` windows of the batch from a start on."""
-    return Window(*(array[start : start + size] for array in windows(batch, span)))
+    """`size` windows of the batch from a start on; each ten of the batch are from another episode."""
+    every = windows(batch, span)
+    every = every._replace(number=np.arange(len(every.number), dtype=np.int32) // 10)
+    return Window(*(array[start : start + size] for array in every))
 
 
 def scaled(batch: Batch, scale: float) -> Batch:
     return Batch(batch.obs * np.float32(scale), batch.action)
 
 
-@pytest.fixture(params=list(REWARDS), scope="module")
+@pytest.fixture(params=list(CASES), scope="module")
 def settings(request: pytest.FixtureRequest) -> Reward:
-    return narrow(REWARDS[request.param](), learning_rate=1e-2)
+    return CASES[request.param]
+
+
+def test_every_class_and_both_heads_are_tested() -> None:
+    assert {type(settings) for settings in CASES.values()} == set(REWARDS.values())
+    assert {"pcil", "tcn", "pcil-gail", "tcn-gail"} <= set(CASES)
 
 
 @pytest.fixture(scope="module")
 def trained(settings: Reward) -> Any:
-    """The state after 60 updates on an expert and an agent that live apart."""
+    """The state after 300 updates on an expert and an agent that live apart."""
     update = jax.jit(lambda state, expert, agent, key: settings.update(state, expert, agent, embed, key=key)[0])
     state = settings.init(DEMOS, embed, key=jax.random.key(0))
-    for i in range(60):
+    for i in range(300):
         start = (i * 32) % 160
         state = update(state, *(rows(b, start, settings.batch_size, settings.span) for b in (EXPERT, AGENT)), jax.random.key(i))
     return state
@@ -120,10 +138,11 @@ def test_order_matters_only_for_episode_scope(settings: Reward, trained: Any) ->
 
 def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) -> None:
     """One equation for all: learned + weight x true, in the shape of the true reward, read from the right state."""
+    settings = dataclasses.replace(settings, task_weight=0.7)
     rng = np.random.default_rng(0)
     obs, action = rng.standard_normal((3, 5, 4), dtype=np.float32), rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32)
     true = rng.standard_normal((3, 4), dtype=np.float32)
     got = label(settings, trained, jnp.asarray(obs), jnp.asarray(action), jnp.asarray(true), embed, key=jax.random.key(9))
     seen = obs[:, 1:] if settings.reads == "next_obs" else obs[:, :-1]
     learned = rewards_of(settings, trained, Batch(seen.reshape(12, 4), action.reshape(12, 2))).reshape(3, 4)
-    assert np.allclose(got, learned + settings.task_weight * true, atol=1e-5)
+    assert np.allclose(got, learned + 0.7 * true, atol=1e-5)

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from typing import Any
 
+import hypothesis
+import hypothesis.extra.numpy as arrays
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jax.extend import core
 from jax.test_util import check_grads
 
+from pcil import learner
 from pcil.learner import frozen_embed
 from pcil.losses import gradient_penalty
 from pcil.networks import MLP, unit_sphere
-from pcil.rewards.pcil import PCIL, derangement, similarity
-from pcil.types import Batch, Spec
+from pcil.rewards import label
+from pcil.rewards.embedding import EmbeddingState
+from pcil.rewards.pcil import PCIL, derangement, stages
+from pcil.types import Batch, Spec, Window
 from small import narrow, random_batch, small_run, windows
 
 
@@ -25,6 +35,15 @@ def features(seed: int, rows: int = 32, dim: int = 6) -> jnp.ndarray:
 
 SETTINGS = narrow(PCIL(), hidden=16)
 ENCODER = MLP.init((6, 16, 16, 16, 4), key=jax.random.key(0))
+
+
+loss = jax.jit(PCIL.loss, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def update(settings: PCIL, state: EmbeddingState, expert: Window, agent: Window, *, key: Any) -> tuple[EmbeddingState, Any]:
+    """One update where the features are the observations."""
+    return settings.update(state, expert, agent, lambda obs: obs, key=key)
 
 
 @pytest.mark.parametrize("temperature", [0.07, 1.0])
@@ -90,14 +109,6 @@ def test_gradients_against_finite_differences() -> None:
             check_grads(jax.jit(loss), (encoder,), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
-def test_similarity_by_hand() -> None:
-    """Two expert rows, three steps: "random" meets rows 0, 1, 0; "mean" meets their mean."""
-    expert = jnp.array([[1.0, 0.0], [0.0, 1.0]])
-    steps = jnp.array([[1.0, 0.0], [1.0, 0.0], [0.6, 0.8]])
-    assert np.allclose(similarity(steps, expert, "random"), [1.0, 0.0, 0.6])
-    assert np.allclose(similarity(steps, expert, "mean"), [0.5, 0.5, 0.7])
-
-
 @pytest.mark.parametrize("compare", ["random", "mean"])
 def test_reward_lies_between_minus_one_and_one(compare: str) -> None:
     settings = dataclasses.replace(SETTINGS, compare=compare)
@@ -138,6 +149,167 @@ def test_no_anchor_is_its_own_positive() -> None:
     for seed in range(50):
         partner = np.asarray(derangement(jax.random.key(seed), 7))
         assert sorted(partner) == list(range(7)) and not (partner == np.arange(7)).any()
+
+
+# --- A lazy penalty ---
+
+
+def test_a_lazy_penalty_comes_at_every_so_many_updates_and_weighs_as_much_more() -> None:
+    """With `penalty_every = 3`: all, with three times the penalty, at updates 0, 3, ...; the contrast alone between."""
+    lazy, key = dataclasses.replace(SETTINGS, penalty_every=3), jax.random.key(4)
+    parts = features(1), features(2), features(3)
+    _, usual = loss(SETTINGS, ENCODER, *parts, key=key)
+    for count in range(7):
+        total, metrics = loss(lazy, ENCODER, *parts, key=key, count=jnp.int32(count))
+        penalty = 3 * float(usual["penalty"]) if count % 3 == 0 else 0.0
+        assert float(metrics["penalty"]) == pytest.approx(penalty, rel=1e-5)
+        assert float(total) == pytest.approx(float(usual["contrast_loss"]) + 10 * penalty, rel=1e-5)
+
+
+def test_updates_are_counted_by_the_state() -> None:
+    lazy = dataclasses.replace(SETTINGS, penalty_every=2)
+    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    state = lazy.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
+    came = []
+    for i in range(5):
+        state, metrics = update(lazy, state, expert, agent, key=jax.random.key(i))
+        came.append(float(metrics["penalty"]) > 0)
+    assert came == [True, False, True, False, True]
+
+
+def products(settings: PCIL) -> tuple[int, int]:
+    """Matrix products in the gradient of the loss: those always computed, and those inside a `cond`."""
+    parts = features(1), features(2), features(3)
+    slope = jax.grad(lambda e, count: settings.loss(e, *parts, key=jax.random.key(4), count=count)[0])
+
+    def count(jaxpr: Any, inside: bool) -> np.ndarray:
+        total = np.zeros(2, int)
+        for equation in jaxpr.eqns:
+            total[int(inside)] += equation.primitive.name == "dot_general"
+            for inner in core.jaxprs_in_params(equation.params):
+                total += count(inner, inside or equation.primitive.name == "cond")
+        return total
+
+    always, sometimes = count(jax.make_jaxpr(slope)(ENCODER, jnp.int32(0)).jaxpr, False)
+    return always, sometimes
+
+
+def test_between_its_turns_a_lazy_penalty_costs_no_matrix_product() -> None:
+    """The contrast alone has 4 layers and the cosines forwards; backwards, 2 for each but the first layer's input: 14."""
+    always, sometimes = products(SETTINGS)
+    lazy_always, lazy_sometimes = products(dataclasses.replace(SETTINGS, penalty_every=4))
+    assert sometimes == 0, "without laziness there is no branch"
+    assert lazy_always == 14 and lazy_sometimes == always - 14 > 0
+
+
+# --- Anchors on the agent's stages ---
+
+
+def test_stages_are_quantiles_of_the_batch_by_hand() -> None:
+    """Of episodes 5, 5, 9, 2, as many rows are from earlier ones as 1, 1, 3, 0."""
+    number = jnp.array([5, 5, 9, 2])
+    assert stages(number, 1).tolist() == [0, 0, 0, 0]
+    assert stages(number, 2).tolist() == [0, 0, 1, 0]
+    assert stages(number, 4).tolist() == [1, 1, 3, 0]
+
+
+@given(number=arrays.arrays(np.int32, 12, elements=st.integers(0, 20)), count=st.integers(1, 6))
+@hypothesis.settings(deadline=None, derandomize=True, max_examples=50)
+def test_stages_follow_the_order_of_episodes_and_part_none(number: np.ndarray, count: int) -> None:
+    stage = np.asarray(stages(jnp.asarray(number), count))
+    assert stage.min() == 0 and stage.max() < count
+    order = np.argsort(number, kind="stable")
+    assert (np.diff(stage[order]) >= 0).all(), "a later episode is never in an earlier stage"
+    assert all(len(set(stage[number == n])) == 1 for n in number)
+    assert np.array_equal(stage, stages(jnp.asarray(3 * number + 7), count)), "only the order counts"
+    if len(set(number)) == 12 and 12 % count == 0:
+        assert np.array_equal(np.bincount(stage), np.full(count, 12 // count)), "stages are of one size"
+
+
+def test_anchors_on_stages_add_their_weighted_loss_and_leave_the_experts_alone() -> None:
+    """Naive loops over agent anchors: same stage draws, other stages and the expert push; the rest of the loss is as ever."""
+    settings, key = dataclasses.replace(SETTINGS, temperature=0.5, stages=3, stage_weight=0.25), jax.random.key(4)
+    parts = features(1), features(2), features(3)
+    number = np.random.default_rng(0).integers(0, 9, 32)
+    total, metrics = loss(settings, ENCODER, *parts, key=key, number=jnp.asarray(number))
+    without, usual = loss(dataclasses.replace(settings, stages=0), ENCODER, *parts, key=key)
+
+    phi_e, phi_a = (np.asarray(unit_sphere(ENCODER(x)), np.float64) for x in parts[:2])
+    stage = [3 * sum(other < own for other in number) // 32 for own in number]
+    assert len(set(stage)) == 3
+    losses = []
+    for i in range(32):
+        against = [phi_a[j] for j in range(32) if stage[j] != stage[i]] + list(phi_e)
+        exponentials = sum(math.exp(phi_a[i] @ other / 0.5) for other in against)
+        mates = [math.exp(phi_a[i] @ phi_a[j] / 0.5) for j in range(32) if j != i and stage[j] == stage[i]]
+        losses.append(np.mean([-math.log(mate / (mate + exponentials)) for mate in mates]))
+    assert float(metrics["stage_loss"]) == pytest.approx(np.mean(losses), rel=1e-5)
+    assert float(total) == pytest.approx(float(without) + 0.25 * np.mean(losses), rel=1e-5)
+    assert all(float(metrics[name]) == pytest.approx(float(usual[name]), rel=1e-6) for name in usual)
+
+
+def test_stages_come_from_the_agents_episodes_and_only_where_they_are_asked_for() -> None:
+    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    mixed = np.arange(32, dtype=np.int32)
+
+    def encoder_after(settings: PCIL, of_expert: np.ndarray, of_agent: np.ndarray) -> np.ndarray:
+        state = settings.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
+        pair = expert._replace(number=of_expert), agent._replace(number=of_agent)
+        return np.asarray(update(settings, state, *pair, key=jax.random.key(1))[0].encoder.weights[0])
+
+    staged = dataclasses.replace(SETTINGS, stages=4)
+    assert not np.array_equal(encoder_after(staged, mixed, 0 * mixed), encoder_after(staged, mixed, mixed))
+    assert np.array_equal(encoder_after(staged, mixed, mixed), encoder_after(staged, 0 * mixed, mixed))
+    assert np.array_equal(encoder_after(SETTINGS, mixed, 0 * mixed), encoder_after(SETTINGS, mixed, mixed))
+
+
+def test_training_gathers_each_stage_and_parts_it_from_the_others() -> None:
+    """Two stages of the agent that lie apart: each becomes a cluster, away from the other and from the expert."""
+    settings = dataclasses.replace(SETTINGS, stages=2, learning_rate=1e-2, penalty=0.0)
+    demo, rows = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
+    late = np.arange(33) % 2
+    agent = windows(rows._replace(obs=rows.obs + np.float32(1.5) * late[:, None].astype(np.float32)))
+    agent = agent._replace(number=late[:32].astype(np.int32))
+    state = settings.init([demo], lambda obs: obs, key=jax.random.key(0))
+    for i in range(200):
+        state, metrics = update(settings, state, windows(demo), agent, key=jax.random.key(i))
+    z = np.asarray(unit_sphere(state.encoder(jnp.asarray(agent.obs[:, 0]))))
+    early, late = (z[late[:32] == which] for which in (0, 1))
+    within = (np.mean(early @ early.T) + np.mean(late @ late.T)) / 2
+    assert within > np.mean(early @ late.T) + 0.8
+    assert float(metrics["negative_similarity"]) < within - 0.8
+
+
+# --- Demonstrations and a reward ---
+
+
+def test_with_a_task_weight_the_label_is_a_weighted_sum_by_hand() -> None:
+    """The relaxed setting of the paper's outlook. Features are the encoder's: a step to (3, 4) has cosine 0.6 with (1, 0).
+
+    Paid 2 by the task with weight 0.5, it is labelled 0.6 + 1.
+    """
+    encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
+    state = EmbeddingState(encoder, None, jnp.array([[1.0, 0.0]]), None)
+    obs, action, paid = jnp.array([[0.0, 1.0], [3.0, 4.0], [-1.0, 0.0]]), jnp.zeros((2, 1)), jnp.array([2.0, -4.0])
+    for weight, expected in ((0.5, [0.6 + 1, -1 - 2]), (0.0, [0.6, -1])):
+        settings = dataclasses.replace(SETTINGS, task_weight=weight)
+        got = label(settings, state, obs, action, paid, lambda x: x, key=jax.random.key(0))
+        assert np.allclose(got, expected, atol=1e-6)
+
+
+def test_the_agent_is_trained_on_the_weighted_sum() -> None:
+    """Through the compiled step, whose target's mean rises by weight x reward, discounted over the window, and nothing else."""
+    run = small_run(reward={"task_weight": 0.5})
+    spec, demos, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.n_step
+    window, expert = windows(random_batch(32 + n, 2, 2, seed=1), n), windows(random_batch(33, 2, 2))
+    targets = []
+    for paid in (0.0, 3.0):
+        state = learner.init(run.learner, spec, [demos], 0)
+        window = window._replace(reward=np.full_like(window.reward, paid))
+        state, _ = learner.update(run.learner, state, window, expert, None, np.int32(0), np.int32(0))
+        targets.append(float(state.totals["agent/target"]))
+    gamma = run.agent.gamma
+    assert targets[1] - targets[0] == pytest.approx(0.5 * 3 * (1 + gamma + gamma**2), rel=1e-4)
 
 
 def test_nothing_flows_into_the_agents_features() -> None:

@@ -4,12 +4,14 @@ from pcil.rewards.adversarial import DAC
 from pcil.rewards.base import Embed, Metrics, Reward, label
 from pcil.rewards.pcil import PCIL
 from pcil.rewards.task import TaskReward
+from pcil.rewards.tcn import TCN
 
 REWARDS: dict[str, type[Reward]] = {
     "pcil": PCIL,
     "dac": DAC,
+    "tcn": TCN,
     "expert": TaskReward,
 }
-"""Reward of each method, by the method's name."""
+"""Every class of reward, by the name of the method that it is for; other methods are the same classes set otherwise."""
 
-__all__ = ["DAC", "PCIL", "REWARDS", "Embed", "Metrics", "Reward", "TaskReward", "label"]
+__all__ = ["DAC", "PCIL", "REWARDS", "TCN", "Embed", "Metrics", "Reward", "TaskReward", "label"]

@@ -11,40 +11,17 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.losses import gradient_penalty, info_nce, interpolate
+from pcil.losses import gradient_penalty, group_info_nce, info_nce, interpolate
 from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.optimiser import adam_count
 from pcil.rewards.base import Embed, Metrics, Reward
+from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding_reward, init_embedding
 from pcil.types import Batch, Window
-
-
-class PCILState(eqx.Module):
-    """The encoder, its optimiser's moments, and the expert states that rewards compare with."""
-
-    encoder: MLP
-    moments: Moments
-    reference: Float[Array, "batch obs"]
-    """The last batch of expert states: partners of the penalty and of the similarity reward."""
-
-
-def similarity(
-    embedding: Float[Array, "T dim"], expert: Float[Array, "batch dim"], how: Literal["random", "mean"]
-) -> Float[Array, " T"]:
-    """The reward `Phi(s) . Phi(s_E)`, in [-1, 1] for unit embeddings (Eq. 2).
-
-    "random" compares step `i` with expert row `i mod batch`, and since the rows are random draws each step meets a random
-    expert sample (authors' code: train.py); "mean" compares with the rows' mean (paper, Appendix B: "similar performance").
-    """
-    if how == "mean":
-        return embedding @ jnp.mean(expert, axis=0)
-    rows = jnp.arange(embedding.shape[0]) % expert.shape[0]
-    return jnp.sum(embedding * expert[rows], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -55,8 +32,16 @@ class PCIL(Reward):
     """Divides the cosines inside the InfoNCE loss."""
     compare: Literal["random", "mean"] = "random"
     """The reward's expert: a random sample or the mean embedding."""
+    head: Head = "similarity"
+    """The reward: similarity to the expert, or the logit of a linear classifier of embeddings ("gail")."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the similarity reward."""
+    penalty_every: int = 1
+    """The penalty is computed at every so many updates, and then weighs as many times more."""
+    stages: int = 0
+    """Anchor on agent rows too, whose positives are from the same of so many stages of training; 0: on the expert alone."""
+    stage_weight: float = 1.0
+    """Weight of the loss of the agent's anchors."""
     hidden: int = 256
     """Width of the three hidden layers; the embedding has a quarter of it."""
     learning_rate: float = 1e-4
@@ -64,17 +49,11 @@ class PCIL(Reward):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(
-            self, temperature=(1e-6, inf), penalty=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf)
-        )
+        check_ranges(self, temperature=(1e-6, inf), penalty=(0, inf), penalty_every=(1, inf), stages=(0, inf))
+        check_ranges(self, stage_weight=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf))
 
-    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> PCILState:
-        encoder_key, reference_key = jax.random.split(key)
-        states = jnp.concatenate([demo.obs for demo in demos])
-        reference = states[jax.random.randint(reference_key, (self.batch_size,), 0, states.shape[0])]
-        features = jax.eval_shape(embed, reference).shape[-1]
-        encoder = MLP.init((features, self.hidden, self.hidden, self.hidden, self.hidden // 4), key=encoder_key)
-        return PCILState(encoder, adam_init(encoder), reference)
+    def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
+        return init_embedding(demos, embed, hidden=self.hidden, batch_size=self.batch_size, head=self.head, key=key)
 
     def loss(
         self,
@@ -84,49 +63,71 @@ class PCIL(Reward):
         partner: Float[Array, "batch features"],
         *,
         key: PRNGKeyArray,
+        number: Int[Array, " batch"] | None = None,
+        count: int | Array = 0,
     ) -> tuple[Float[Array, ""], Metrics]:
         """InfoNCE with expert anchors and all agent samples as negatives, plus the penalty on the reward's slope.
 
         An anchor's positive is one random other row of the expert batch. The penalty is taken on the features between an
         expert and an agent row; its scalar is `Phi(mix) . Phi(partner)`, the reward, with the partner's side held fixed.
+        `count` updates came before; a lazy penalty is computed at every `penalty_every`-th and then weighs as many times more.
+        `number`, the agent rows' episodes, is needed for anchors on the agent's stages alone.
         """
         shift_key, mix_key = jax.random.split(key)
         raw = encoder(jnp.concatenate([expert, agent]))
         sphere = unit_sphere(raw)
         anchor, negatives = jnp.split(sphere, [expert.shape[0]])
         positive = anchor[derangement(shift_key, expert.shape[0])]
-        contrast, diagnostics = info_nce(anchor, positive, negatives, self.temperature)
+        loss, diagnostics = info_nce(anchor, positive, negatives, self.temperature)
 
-        fixed = jax.lax.stop_gradient(unit_sphere(encoder(partner)))
-        u = jax.random.uniform(mix_key, (expert.shape[0], 1))
-        mixed = interpolate(u, expert, agent[: expert.shape[0]])
-        slope = gradient_penalty(lambda x: jnp.sum(unit_sphere(encoder(x)) * fixed, axis=-1), mixed)
+        def slope() -> Float[Array, ""]:
+            fixed = jax.lax.stop_gradient(unit_sphere(encoder(partner)))
+            u = jax.random.uniform(mix_key, (expert.shape[0], 1))
+            mixed = interpolate(u, expert, agent[: expert.shape[0]])
+            return gradient_penalty(lambda x: jnp.sum(unit_sphere(encoder(x)) * fixed, axis=-1), mixed)
+
+        every = self.penalty_every
+        penalty = slope() if every == 1 else every * jax.lax.cond(count % every == 0, slope, lambda: jnp.zeros(()))
         metrics = diagnostics | {
-            "contrast_loss": contrast,
-            "penalty": slope,
+            "contrast_loss": loss,
+            "penalty": penalty,
             "embedding_norm": jnp.mean(jnp.linalg.norm(raw, axis=-1)),
         }
-        return contrast + self.penalty * slope, metrics
+        loss = loss + self.penalty * penalty
+        if self.stages:
+            assert number is not None
+            metrics["stage_loss"] = group_info_nce(negatives, stages(number, self.stages), anchor, self.temperature)
+            loss = loss + self.stage_weight * metrics["stage_loss"]
+        return loss, metrics
 
     def update(
-        self, state: PCILState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
-    ) -> tuple[PCILState, Metrics]:
-        states = jnp.asarray(expert.obs[:, 0])
+        self, state: EmbeddingState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+    ) -> tuple[EmbeddingState, Metrics]:
+        states, number = jnp.asarray(expert.obs[:, 0]), jnp.asarray(agent.number)
         features = [embed(obs) for obs in (states, jnp.asarray(agent.obs[:, 0]), state.reference)]
-        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, key=key)
-        encoder, moments = adam_step(state.encoder, gradient, state.moments, self.learning_rate)
-        return PCILState(encoder, moments, states), metrics
+        gradient_of = jax.grad(self.loss, has_aux=True)
+        gradient, metrics = gradient_of(state.encoder, *features, key=key, number=number, count=adam_count(state.moments))
+        state, more = advance(state, gradient, states, features[:2], self.learning_rate)
+        return state, metrics | more
 
     def reward(
-        self, state: PCILState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
+        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
     ) -> Float[Array, " T"]:
         del action, key
-        both = unit_sphere(state.encoder(embed(jnp.concatenate([state.reference, obs]))))
-        expert, agent = jnp.split(both, [state.reference.shape[0]])
-        return similarity(agent, expert, self.compare)
+        return embedding_reward(state, obs, embed, self.compare)
 
 
 def derangement(key: PRNGKeyArray, size: int) -> Array:
     """Random partners, none of them oneself: a random order, shifted by one along itself."""
     order = jax.random.permutation(key, size)
     return jnp.zeros(size, order.dtype).at[order].set(jnp.roll(order, 1))
+
+
+def stages(number: Int[Array, " batch"], count: int) -> Int[Array, " batch"]:
+    """The stage of training, from 0 to `count - 1`, that each row's policy is from, by the number of the row's episode.
+
+    A row of which a share `q` of the batch is from earlier episodes is in stage `floor(count q)`: the stages are quantiles of
+    the batch, and rows of one episode, thus of about one policy, are never parted.
+    """
+    earlier = jnp.sum(number[None, :] < number[:, None], axis=1)
+    return earlier * count // len(number)

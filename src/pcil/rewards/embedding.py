@@ -1,0 +1,102 @@
+"""What PCIL and TCN share: an encoder on the unit sphere, and the two heads that make a reward of it (paper Table 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pcil.losses import binary_cross_entropy
+from pcil.networks import MLP, unit_sphere
+from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.rewards.base import Embed, Metrics
+from pcil.types import Batch
+
+Head = Literal["similarity", "gail"]
+"""How a reward is made of an embedding: its cosine to an expert's, or the logit of a linear classifier."""
+
+
+class Classifier(eqx.Module):
+    """A linear classifier of embeddings, expert or agent, and its optimiser's moments."""
+
+    linear: MLP
+    moments: Moments
+
+
+class EmbeddingState(eqx.Module):
+    """The encoder, its optimiser's moments, the expert states that rewards compare with, and the head that learns, if any."""
+
+    encoder: MLP
+    moments: Moments
+    reference: Float[Array, "batch obs"]
+    """The last batch of expert states: partners of PCIL's penalty and of the similarity reward."""
+    classifier: Classifier | None
+
+
+def init_embedding(
+    demos: Sequence[Batch], embed: Embed, *, hidden: int, batch_size: int, head: Head, key: PRNGKeyArray
+) -> EmbeddingState:
+    """Three hidden layers and a quarter of their width as output (256-256-256-64: paper Appendix B); random references."""
+    encoder_key, reference_key = jax.random.split(key)
+    states = jnp.concatenate([demo.obs for demo in demos])
+    reference = states[jax.random.randint(reference_key, (batch_size,), 0, states.shape[0])]
+    features = jax.eval_shape(embed, reference).shape[-1]
+    encoder = MLP.init((features, hidden, hidden, hidden, hidden // 4), key=encoder_key)
+    linear = MLP.init((hidden // 4, 1), key=jax.random.fold_in(key, 0)) if head == "gail" else None
+    return EmbeddingState(encoder, adam_init(encoder), reference, linear and Classifier(linear, adam_init(linear)))
+
+
+def advance(
+    state: EmbeddingState,
+    gradient: MLP,
+    reference: Float[Array, "batch obs"],
+    features: Sequence[Float[Array, "batch features"]],
+    learning_rate: float,
+) -> tuple[EmbeddingState, Metrics]:
+    """One step of the encoder against its gradient, and of the classifier, if there is one.
+
+    The classifier learns from the embeddings of expert and agent `features` as they were before this step, with label 1 for
+    the expert. They are its data: no gradient flows through them into the encoder (paper section 4.4).
+    """
+    encoder, moments = adam_step(state.encoder, gradient, state.moments, learning_rate)
+    if state.classifier is None:
+        return EmbeddingState(encoder, moments, reference, None), {}
+    expert, agent = jnp.split(unit_sphere(state.encoder(jnp.concatenate(features))), [len(features[0])])
+
+    def loss(linear: MLP) -> tuple[Float[Array, ""], Metrics]:
+        logits = linear(expert)[:, 0], linear(agent)[:, 0]
+        entropy = binary_cross_entropy(*logits)
+        return entropy, {"head_loss": entropy, "expert_logit": jnp.mean(logits[0]), "agent_logit": jnp.mean(logits[1])}
+
+    slope, metrics = jax.grad(loss, has_aux=True)(state.classifier.linear)
+    classifier = Classifier(*adam_step(state.classifier.linear, slope, state.classifier.moments, learning_rate))
+    return EmbeddingState(encoder, moments, reference, classifier), metrics
+
+
+def embedding_reward(
+    state: EmbeddingState, obs: Float[Array, "T obs"], embed: Embed, compare: Literal["random", "mean"]
+) -> Float[Array, " T"]:
+    """The head's reward: the similarity, or `log D - log(1 - D)`, which is the classifier's logit itself."""
+    if state.classifier is not None:
+        return state.classifier.linear(unit_sphere(state.encoder(embed(obs))))[:, 0]
+    both = unit_sphere(state.encoder(embed(jnp.concatenate([state.reference, obs]))))
+    expert, agent = jnp.split(both, [state.reference.shape[0]])
+    return similarity(agent, expert, compare)
+
+
+def similarity(
+    embedding: Float[Array, "T dim"], expert: Float[Array, "batch dim"], how: Literal["random", "mean"]
+) -> Float[Array, " T"]:
+    """The reward `Phi(s) . Phi(s_E)`, in [-1, 1] for unit embeddings (Eq. 2).
+
+    "random" compares step `i` with expert row `i mod batch`, and since the rows are random draws each step meets a random
+    expert sample (authors' code: train.py); "mean" compares with the rows' mean (paper, Appendix B: "similar performance").
+    """
+    if how == "mean":
+        return embedding @ jnp.mean(expert, axis=0)
+    rows = jnp.arange(embedding.shape[0]) % expert.shape[0]
+    return jnp.sum(embedding * expert[rows], axis=-1)

@@ -308,8 +308,8 @@ def test_the_agent_is_trained_on_the_weighted_sum() -> None:
         window = window._replace(reward=np.full_like(window.reward, paid))
         state, _ = learner.update(run.learner, state, window, expert, None, np.int32(0), np.int32(0))
         targets.append(float(state.totals["agent/target"]))
-    gamma = run.agent.gamma
-    assert targets[1] - targets[0] == pytest.approx(0.5 * 3 * (1 + gamma + gamma**2), rel=1e-4)
+    discounts = sum(run.agent.gamma**k for k in range(n))
+    assert targets[1] - targets[0] == pytest.approx(0.5 * 3 * discounts, rel=1e-4)
 
 
 def test_nothing_flows_into_the_agents_features() -> None:

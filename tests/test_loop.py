@@ -68,7 +68,13 @@ def finish(run: Run, folder: Path, stops: tuple[int, ...] = ()) -> None:
     runs.execute(run, folder, runs.Silent())
 
 
-CASES = [("pcil", "sampled"), ("pcil", "stored"), ("dac", "sampled"), ("expert", "stored")]
+CASES = [
+    ("pcil", "sampled"),
+    ("pcil", "stored"),
+    ("dac", "sampled"),
+    ("expert", "stored"),
+    *((name, "stored") for name in ("pwil", "sil", "potil")),
+]
 
 
 @pytest.mark.parametrize(("method", "label"), CASES)

@@ -23,7 +23,11 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
     "errors types seeds compilation",
+<<<<<<< HEAD
     "losses optimiser networks noise theory",
+=======
+    "losses transport optimiser networks noise",
+>>>>>>> b8d5b4d (PWIL, SIL and POTIL: rewards of whole episodes by optimal transport)
     "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
     "bench doctor arguments cli",

@@ -18,8 +18,9 @@ POINT_MASS = "toy/point_mass-v0"
 
 
 def narrow(settings: Any, **changes: Any) -> Any:
-    """An agent's or a reward's settings with hidden width 16 and batches of 32, where it has them."""
-    small = {"hidden": 16, "batch_size": 32, "feature_dim": 8, "noise": LinearSchedule(1.0, 0.1, 1000)} | changes
+    """An agent's or a reward's settings with hidden width 16, batches of 32 and frequent turns, where it has them."""
+    small = {"hidden": 16, "batch_size": 32, "feature_dim": 8, "noise": LinearSchedule(1.0, 0.1, 1000)}
+    small |= {"refresh": 30, "every": 2} | changes
     names = {field.name for field in dataclasses.fields(settings)}
     if "batch_size" in names and settings.batch_size == 0:
         small.pop("batch_size")

@@ -76,6 +76,7 @@ CASES = [
     ("tcn", "sampled", {"negatives": "rollout", "margin": 5}),  # windows of its own, of ten steps
     ("pcil-gail", "stored", {"penalty_every": 3, "stages": 2}),
     ("tcn-gail", "sampled", {}),
+    *((name, "stored", {}) for name in ("pwil", "sil", "potil")),
 ]
 
 

@@ -23,7 +23,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
     "errors types seeds compilation",
-    "losses optimiser networks noise theory",
+    "losses transport optimiser networks noise theory",
     "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
     "bench doctor arguments cli",

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil import seeds
 from pcil.config import Method
 from pcil.networks import Actor, Trunk
-from pcil.rewards import label
+from pcil.rewards import label, states_read
 from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec, Window
 
@@ -100,6 +100,20 @@ def _step(
     return Learner(agent_state, reward_state, learner.root, learner.totals), metrics
 
 
+def close_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Learner:
+    """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
+    if method.reward.scope == "step":
+        return learner
+    reward = _after_rows(method, learner, episode.obs, episode.action, np.int32(count))
+    return Learner(learner.agent, reward, learner.root, learner.totals)
+
+
+@functools.partial(jax.jit, static_argnames="method")
+def _after_rows(method: Method, learner: Learner, obs: Array, action: Array, count: Array) -> Any:
+    obs, key = states_read(method.reward, obs), _label_key(learner, count)
+    return method.reward.after_episode(learner.reward, obs, action, frozen_embed(method, learner.agent), key=key)
+
+
 def label_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
     """The reward of each step of one whole episode.
 
@@ -115,5 +129,9 @@ def label_episode(method: Method, learner: Learner, episode: Episode, count: int
 
 @functools.partial(jax.jit, static_argnames="method")
 def _label_rows(method: Method, learner: Learner, obs: Array, action: Array, task_reward: Array, count: Array) -> Array:
-    key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.LABEL, count)
-    return label(method.reward, learner.reward, obs, action, task_reward, frozen_embed(method, learner.agent), key=key)
+    embed, key = frozen_embed(method, learner.agent), _label_key(learner, count)
+    return label(method.reward, learner.reward, obs, action, task_reward, embed, key=key)
+
+
+def _label_key(learner: Learner, count: Array) -> PRNGKeyArray:
+    return seeds.key(jax.random.wrap_key_data(learner.root), Stream.LABEL, count)

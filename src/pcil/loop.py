@@ -96,6 +96,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
             else:
                 episode = _play(run, env, spec, state)
                 kept = episode.absorbed() if run.agent.absorbing else episode
+                state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
                 learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
                 state.replay.add(kept, learned if run.label == "stored" else kept.reward)
                 _log_pass(state, _described(episode, learned), log, clock)

@@ -14,7 +14,7 @@ from pcil.agents import BC, DrQV2
 from pcil.config import Run, changed
 from pcil.errors import InputError
 from pcil.noise import LinearSchedule
-from pcil.rewards import DAC, PCIL, TCN, TaskReward
+from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN, TaskReward
 
 
 def paper(task: str) -> dict[str, Any]:
@@ -89,6 +89,26 @@ BC_SETTINGS: dict[str, Any] = {
     "reward": TaskReward(task_weight=0.0),  # none is used
 }
 
+PWIL_AS_RELEASED: dict[str, Any] = {
+    "random_frames": 4000,  # authors' cfgs: 2000 agent steps
+    "agent.noise": LinearSchedule(0.1, 0.1, 1),  # authors' cfgs: a constant 0.1
+    "reward": PWIL(
+        batch_size=0,  # nothing is learned
+        inputs="trunk",  # authors' agent/pwil.py
+        alpha=5.0,  # authors' agent/pwil.py
+        beta=5.0,  # authors' agent/pwil.py
+        subsampling=1,  # authors' agent/pwil.py
+        refresh=5000,  # authors' train.py: 10000 agent steps
+        prefill_steps=0,  # authors' train.py
+    ),
+    "reward.batch_size": 0,  # nothing is learned
+}
+
+SIL_AS_RELEASED: dict[str, Any] = {
+    "random_frames": 0,  # authors' cfgs
+    "agent.noise": LinearSchedule(0.1, 0.1, 1),  # authors' cfgs: a constant 0.1
+}
+
 METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("pcil", "paper"): {"reward": PCIL(temperature=0.07)},  # paper Table
     ("pcil", "released"): {"reward": PCIL(temperature=1.0, hidden=1024)},  # authors' pcil.py: T is never applied; dmc.yaml
@@ -96,6 +116,15 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("dac", "paper"): {"reward": DAC()},  # authors' agent/dac.py
     ("dac", "released"): {"reward": DAC(hidden=1024)},  # authors' agent/dac.py, dmc.yaml
     ("dac", "default"): {"reward": DAC(learning_rate=5e-4)},  # ours
+    ("pwil", "paper"): {"reward": PWIL()},  # Dadashi et al. 2021, on all states
+    ("pwil", "released"): PWIL_AS_RELEASED,
+    ("pwil", "default"): {"reward": PWIL(), "label": "stored"},  # as paper
+    ("sil", "paper"): {"reward": SIL(learning_rate=1e-4)},  # paper Table; otherwise Papagiannis and Li 2020: no text for SIL
+    ("sil", "released"): {"reward": SIL(), **SIL_AS_RELEASED},  # Papagiannis and Li 2020: the release has POTIL alone
+    ("sil", "default"): {"reward": SIL(), "label": "stored"},  # ours
+    ("potil", "paper"): {"reward": POTIL()},  # authors' agent/potil.py: no text for it
+    ("potil", "released"): {"reward": POTIL(), **SIL_AS_RELEASED, "reward.batch_size": 0},  # authors' agent/potil.py
+    ("potil", "default"): {"reward": POTIL(), "label": "stored"},  # as paper
     ("tcn", "paper"): {"reward": TCN(temperature=0.07)},  # paper Appendix C
     ("tcn", "released"): {"reward": TCN(temperature=0.07, hidden=1024)},  # not in the release: Appendix C; size of dmc.yaml
     ("tcn", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4)},  # Appendix C; rate: ours

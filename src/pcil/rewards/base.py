@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal
 
-from jaxtyping import Array, Float, PRNGKeyArray
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
 from pcil.types import Batch, Window
@@ -16,6 +19,23 @@ from pcil.types import Batch, Window
 Metrics = dict[str, Float[Array, ""]]
 Embed = Callable[[Float[Array, "*batch obs"]], Float[Array, "*batch features"]]
 """The agent's features of an observation; no gradient flows through them. It is a pytree, so a state may keep it."""
+
+
+class SlowFeatures(eqx.Module):
+    """A copy of the agent's features that stays as it is until so many updates have passed."""
+
+    embed: Embed
+    updates: Int[Array, ""]
+
+    @classmethod
+    def init(cls, embed: Embed) -> SlowFeatures:
+        return cls(jax.tree.map(jnp.copy, embed), jnp.int32(0))
+
+    def update(self, embed: Embed, every: int) -> SlowFeatures:
+        """One update later, with the agent's features of now if their turn has come."""
+        updates = self.updates + 1
+        newer = jax.tree.map(lambda old, new: jnp.where(updates % every == 0, new, old), self.embed, embed)
+        return SlowFeatures(newer, updates)
 
 
 @dataclass(frozen=True)
@@ -81,6 +101,27 @@ class Reward(abc.ABC):
     ) -> Float[Array, " T"]:
         """The reward of `T` steps; which state `obs` holds is said by `reads`."""
 
+    def after_episode(
+        self,
+        state: Any,
+        obs: Float[Array, "T obs"],
+        action: Float[Array, "T action"],
+        embed: Embed,
+        *,
+        key: PRNGKeyArray,
+    ) -> Any:
+        """The state once an episode has ended and before it is labelled, where `scope` is "episode".
+
+        All arguments are those that `reward` is given next for the same episode, the key among them.
+        """
+        del obs, action, embed, key
+        return state
+
+
+def states_read(settings: Reward, obs: Float[Array, "*batch states obs"]) -> Float[Array, "*batch n obs"]:
+    """The states that a reward `reads`, one a step."""
+    return obs[..., 1:, :] if settings.reads == "next_obs" else obs[..., :-1, :]
+
 
 def label(
     settings: Reward,
@@ -96,7 +137,6 @@ def label(
 
     This is the one place where the two meet. Leading dimensions are flattened, so a reward sees rows of steps only.
     """
-    seen = obs[..., 1:, :] if settings.reads == "next_obs" else obs[..., :-1, :]
-    rows, row_actions = seen.reshape(-1, seen.shape[-1]), action.reshape(-1, action.shape[-1])
+    rows, row_actions = states_read(settings, obs).reshape(-1, obs.shape[-1]), action.reshape(-1, action.shape[-1])
     learned = settings.reward(state, rows, row_actions, embed, key=key)
     return learned.reshape(task_reward.shape) + settings.task_weight * task_reward

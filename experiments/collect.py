@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from pcil.report.load import read_run, write_points
+from pcil.report.load import read_run, write_rows
 
 
 def main(target: str, *runs: str) -> None:
@@ -12,7 +12,7 @@ def main(target: str, *runs: str) -> None:
     for run in runs:
         folder, _, variant = run.partition("=")
         points += read_run(Path(folder), variant or None)
-    write_points(Path(target), points)
+    write_rows(Path(target), points)
 
 
 main(*sys.argv[1:])

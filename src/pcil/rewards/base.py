@@ -81,6 +81,13 @@ class Reward(abc.ABC):
     ) -> Float[Array, " T"]:
         """The reward of `T` steps; which state `obs` holds is said by `reads`."""
 
+    def representation(
+        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T dim"] | None:
+        """Where the reward has put `T` steps, if it learns a representation; given what `reward` is given."""
+        del state, obs, action, embed
+        return None
+
 
 def label(
     settings: Reward,

@@ -125,6 +125,13 @@ class PCIL(Reward):
         expert, agent = jnp.split(both, [state.reference.shape[0]])
         return similarity(agent, expert, self.compare)
 
+    def representation(
+        self, state: PCILState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T dim"]:
+        """The embedding `Phi(s)`, on the unit sphere."""
+        del action
+        return unit_sphere(state.encoder(embed(obs)))
+
 
 def derangement(key: PRNGKeyArray, size: int) -> Array:
     """Random partners, none of them oneself: a random order, shifted by one along itself."""

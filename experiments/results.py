@@ -1,39 +1,54 @@
 """Draw the figures and fill the tables of the docs from results/*.csv and what ships: python experiments/results.py [--check]
 
-With --check nothing is written; exit code 1 where a table is stale.
+With --check nothing is written; exit code 1 where a table is stale. A page asks for a table of a report by a pair of marks
+such as `<!-- finals:pcil-200k -->` and `<!-- /finals:pcil-200k -->`: the table's name, and the file of results it is made of.
 """
 
 from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from pcil.demos import shipped
-from pcil.report.figures import grid
-from pcil.report.load import Point, read_points
+from pcil.report import figures, stats, tables
+from pcil.report.load import Collection, collect
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+MARKED = re.compile(r"(<!-- ([\w:-]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
 
 
 def main(words: list[str]) -> int:
     """Every table, and the figures too unless only a check is asked for."""
-    tables = {"demos": demos_table(), "pcil": finals_table(read_points(ROOT / "results" / "pcil-200k.csv"))}
+    own: dict[str, Callable[[], str]] = {"demos": demos_table, "pcil": lambda: finals_table(results("pcil-200k"))}
+
+    def fresh(mark: re.Match[str]) -> str:
+        name, _, file = mark[2].partition(":")
+        return mark[1] + (tables.markdown(tables.MAKERS[name](results(file))) if file else own[name]()) + mark[3]
+
     stale = 0
     for page in PAGES:
         text = page.read_text()
-        fresh = text
-        for name, table in tables.items():
-            fresh = re.sub(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", rf"\g<1>{table}\g<2>", fresh, flags=re.DOTALL)
-        stale += fresh != text
+        filled = MARKED.sub(fresh, text)
+        stale += filled != text
         if "--check" not in words:
-            page.write_text(fresh)
+            page.write_text(filled)
     if "--check" in words:
         return int(stale > 0)
-    for table in sorted((ROOT / "results").glob("*.csv")):
-        print(grid(read_points(table), ROOT / "docs" / "figures" / table.stem).relative_to(ROOT))
+    for file in sorted((ROOT / "results").iterdir()):
+        found, path = collect(sorted(file.glob("*.csv")) or [file]), ROOT / "docs" / "figures" / file.stem
+        _ = figures.clouds(found.dots, path) if found.dots else figures.grid(found.points, path)
+        print(path.relative_to(ROOT))
     return 0
+
+
+@cache
+def results(name: str) -> Collection:
+    """The rows of `results/<name>.csv`."""
+    return collect([ROOT / "results" / f"{name}.csv"])
 
 
 def demos_table() -> str:
@@ -46,17 +61,16 @@ def demos_table() -> str:
     return "\n".join([*lines, ""])
 
 
-def finals_table(points: list[Point]) -> str:
-    """The last evaluation of each seed, and their mean beside the demonstrations' return."""
-    lines = ["| task | demonstrations | seed: final return | mean | of the expert |", "|---|---|---|---|---|"]
-    for task in dict.fromkeys(point.task for point in points):
-        last = {point.seed: point for point in points if point.task == task}  # rows are in the order of time
-        finals = [point.return_mean for point in last.values()]
+def finals_table(found: Collection) -> str:
+    """The last evaluation of each seed, and their mean with Student's 95% interval beside the demonstrations' return."""
+    lines = ["| task | demonstrations | seed: final return | mean [95% interval] | of the expert |", "|---|---|---|---|---|"]
+    for task in dict.fromkeys(point.task for point in found.points):
+        last = {point.seed: point for point in found.points if point.task == task}  # rows are in the order of time
+        mean = stats.mean_interval([point.return_mean for point in last.values()])
         expert = next(point.expert_return for point in last.values())
-        mean = sum(finals) / len(finals)
         seeds = ", ".join(f"{seed}: {point.return_mean:.1f}" for seed, point in last.items())
-        share = f"{mean / expert:.0%}" if expert else ""
-        lines.append(f"| {task} | {expert:.1f} | {seeds} | {mean:.1f} | {share} |")
+        share = f"{mean.value / expert:.0%}" if expert else ""
+        lines.append(f"| {task} | {expert:.1f} | {seeds} | {tables.cell(mean)} | {share} |")
     return "\n".join([*lines, ""])
 
 

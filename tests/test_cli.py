@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import html
 import io
 import json
 import re
@@ -144,6 +145,12 @@ OTHERS = [
     ("record run --out run", "exists already"),
     ("record run --out run/run.json/new", "can not be written"),
     ("record run --out new --episodes 1 --minimum-return 1000", "Only 0 of 10 episodes"),
+    ("report", "Missing from pcil report: --out PATH"),
+    ("report --out new", "There is no run in nothing"),
+    ("report nowhere --out new", "nowhere does not exist"),
+    ("report run/tensorboard --out new", "There is no run in run/tensorboard; give folders that pcil train made"),
+    ("report run/run.json --out new", "run.json is no file of results"),
+    ("report run --out run/run.json/new", "can't be written"),
     ("demos walker_walk", "Unrecognized options: walker_walk"),
     ("bench --preset best", "'best'"),
     ("doctor --json", "Unrecognized options: --json"),
@@ -348,6 +355,27 @@ def test_what_is_recorded_can_be_trained_from(run: Path, tmp_path: Path, capsys:
     assert f"of the expert's {recorded.return_mean:.1f}" in capsys.readouterr().out
     about = json.loads((tmp_path / "second" / "run.json").read_text())
     assert about["demos"] == {"hash": recorded.hash, "episodes": 4, "return_mean": recorded.return_mean}
+
+
+def test_a_report_of_a_run_is_a_page(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With its representation; point mass has no pictures, which is said. The run is left as it was."""
+    before = files(run)
+    assert cli.main(["report", str(run), "--out", "report"]) == 0
+    note, said = capsys.readouterr().out.splitlines()
+    assert note.startswith("1 of 1 animations are left out: ") and said == f"Report: {Path('report') / 'index.html'}"
+    text = html.unescape((tmp_path / "report" / "index.html").read_text())
+    assert "Probability" not in text and "No animation" in text and "reward.hidden: 16" in text and note in text
+    rows = (tmp_path / "report" / "tables" / "transitions.csv").read_text().splitlines()
+    assert len(rows) == 1 + 128 + 50 and (tmp_path / "report" / "figures" / "representation.pdf").exists()
+    assert files(run) == before
+
+
+def test_a_report_without_rollouts_needs_files_alone(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(run / "checkpoint")
+    shutil.rmtree(run / "policy")
+    assert cli.main(["report", str(run), "--out", "report", "--no-rollouts"]) == 0
+    assert capsys.readouterr().out == f"Report: {Path('report') / 'index.html'}\n"
+    assert not (tmp_path / "report" / "tables" / "transitions.csv").exists()
 
 
 def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:

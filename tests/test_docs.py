@@ -18,6 +18,7 @@ import pytest
 
 from pcil import checkpoint, learner, presets
 from pcil.agents import BC, DrQV2
+from pcil.cli import COMMANDS
 from pcil.config import Run
 from pcil.rewards import REWARDS, Reward, TaskReward
 from pcil.types import Episode, Spec
@@ -209,9 +210,7 @@ def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) 
 def test_every_option_in_the_docs_is_one() -> None:
     known = set(re.findall(r"--[a-z][\w.-]*", (ROOT / "docs" / "cli.md").read_text()))
     for page in PAGES:
-        for line in re.findall(
-            r"^.*\bpcil (?:train|evaluate|demos|record|theory|bench|doctor)\b.*$", page.read_text(), re.MULTILINE
-        ):
+        for line in re.findall(rf"^.*\bpcil (?:{'|'.join(COMMANDS)})\b.*$", page.read_text(), re.MULTILINE):
             assert set(re.findall(r"(?<!\S)--[a-z][\w.-]*\w", line)) <= known, line
 
 

@@ -272,6 +272,13 @@ def _theory(words: list[str]) -> int:
     return arguments.call("theory", check, words)
 
 
+def _report(words: list[str]) -> int:
+    """Draw figures, tables and a page from runs."""
+    from pcil.reporting import report
+
+    return arguments.call("report", report, words)
+
+
 def _bench(words: list[str]) -> int:
     """Measure the speed of each part, and its ratio to the floor."""
 
@@ -336,6 +343,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "demos": _demos,
     "record": _record,
     "theory": _theory,
+    "report": _report,
     "bench": _bench,
     "doctor": _doctor,
 }

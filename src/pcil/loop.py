@@ -81,7 +81,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
     env = envs.make(run.task)
     spec = envs.spec(env)
     rollout = [envs.make(run.task) for _ in range(run.evaluate_episodes)]
-    state, positions = _resume(run, folder, _start(run, spec, demos), reporter)
+    state, positions = resume(run, folder, start(run, spec, demos), reporter)
     clock = _Clock(state.counters.seconds)
     saved = clock.total()
 
@@ -94,7 +94,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
                 _study(run, spec, state)
                 _log_pass(state, {}, log, clock)
             else:
-                episode = _play(run, env, spec, state)
+                episode = play(run, env, spec, state)
                 kept = episode.absorbed() if run.agent.absorbing else episode
                 state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
                 learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
@@ -116,7 +116,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
     return state
 
 
-def _play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
+def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
     """One episode: act, update (the device works while the environment steps), step."""
     counters = state.counters
     act_rng = seeds.rng(run.seed, Stream.ACT, counters.episodes)
@@ -228,7 +228,7 @@ def _evaluate(
     return result
 
 
-def _start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
+def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     """The state before the first step."""
     if run.agent.absorbing:
         demos, spec = [episode.absorbed() for episode in demos], spec._replace(obs_dim=spec.obs_dim + 1)
@@ -254,7 +254,7 @@ def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
 
 
-def _resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[State, dict[str, int]]:
+def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[State, dict[str, int]]:
     """The state of the newest whole checkpoint and the lengths its logs had; `fresh` and no lengths where there is none."""
     arrays, meta, complaints = checkpoint.restore(folder / "checkpoint")
     for complaint in complaints:

@@ -73,13 +73,6 @@ class MetricWriter:
         self._files[name].flush()
 
 
-def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
-    """The columns of a run's `eval.csv`, as arrays."""
-    with (folder / "eval.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in EVAL_COLUMNS}
-
-
 def pearson(x: np.ndarray, y: np.ndarray) -> float:
     """Pearson correlation; 0 where one of the two does not vary."""
     if np.ptp(x) == 0 or np.ptp(y) == 0:

@@ -58,7 +58,7 @@ def test_a_run_clones_the_optimal_policy_without_a_step_in_the_environment(
     """Its steps are counted in evaluations only; after 1200 updates its actions are the expert's."""
     demos = save_point_mass_demos(tmp_path)
     played = []
-    monkeypatch.setattr(loop, "_play", lambda *_: played.append(1))
+    monkeypatch.setattr(loop, "play", lambda *_: played.append(1))
     result = runs.execute(small_bc(demos), tmp_path / "run", runs.Silent())
     assert not played and (tmp_path / "run" / "eval.csv").read_text().count("\n") == 1 + 3 * 2
     recorded = runs.Demonstrations.load(demos)

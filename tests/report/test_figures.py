@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
+from pcil import presets
 from pcil.report import figures
-from pcil.report.load import Point
+from pcil.report.load import Dot, Point
 
 EVALUATIONS = """\
 frames,episode,return,length,seconds
@@ -52,9 +53,8 @@ def curve(
     task: str, method: str, seed: int, *means: float, variant: str = "default", expert: float | None = 9.0
 ) -> list[Point]:
     """One evaluation every 1000 frames."""
-    return [
-        Point(task, method, variant, seed, 1000 * i, mean, mean - 1, mean + 1, expert, "abc") for i, mean in enumerate(means)
-    ]
+    triples = [(float(mean), mean - 1.0, mean + 1.0) for mean in means]
+    return [Point(task, method, variant, seed, 1000 * i, *triple, expert, "abc") for i, triple in enumerate(triples)]
 
 
 def lines(axes: Axes) -> dict[str, list[float]]:
@@ -82,7 +82,7 @@ def test_a_runs_curve_is_a_picture_in_its_folder(run: Path) -> None:
 def test_a_runs_curve_shows_its_numbers(run: Path, drawn: list[Axes]) -> None:
     figures.run_curve(run, 160.0)
     (axes,) = drawn
-    assert lines(axes) == {"mean": [20.0, 150.5, 7.25], "expert 160": [160.0, 160.0]}
+    assert lines(axes) == {"mean": [20.0, 150.5, 7.25], "demos": [160.0, 160.0]}
     assert list(axes.lines[0].get_xdata()) == [0, 1000, 20000]
     (band,) = axes.collections
     assert band.get_datalim(axes.transData).intervaly.tolist() == [7.25, 200.5]
@@ -104,38 +104,134 @@ def test_axes_begin_at_zero_except_where_returns_are_below(run: Path, drawn: lis
     assert below[0] < -900 and below[1] > -150
 
 
-def test_a_grid_is_a_png_and_a_pdf(tmp_path: Path) -> None:
+def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:
     points = curve("one", "pcil", 1, 1, 2, 3) + curve("two", "a new method", 1, 1, 1, expert=None)
-    path = figures.grid(points, tmp_path / "deep" / "all.png")
-    assert path == tmp_path / "deep" / "all.png"
+    svg = figures.grid(points, tmp_path / "deep" / "all")
+    path = tmp_path / "deep" / "all.png"
     assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+    assert svg.startswith("<?xml") and svg.rstrip().endswith("</svg>")
     image = pixels(path)
     assert image.shape[1] > 2 * image.shape[0], "two panels side by side"
     assert all(half.std() > 0.03 for half in np.array_split(image, 2, axis=1))
 
 
 def test_a_grid_shows_means_over_seeds_as_far_as_all_have_come(tmp_path: Path, drawn: list[Axes]) -> None:
+    """Student's interval of two numbers is +- 12.706 half distances; the band is drawn although the axis may cut it."""
     figures.grid(curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6), tmp_path / "grid")
     (axes,) = drawn
-    assert lines(axes) == {"pcil (2 seeds)": [2, 4], "expert 9": [9, 9]}
+    assert lines(axes) == {"pcil": [2, 4], "demos": [9, 9]} and axes.get_title() == "task, 2 seeds"
     assert [list(line.get_ydata()) for line in axes.lines[:2]] == [[1, 2, 3], [3, 6]]
+    (band,) = axes.collections
+    assert np.allclose(band.get_datalim(axes.transData).intervaly, [4 - 12.706 * 2, 4 + 12.706 * 2], atol=1e-2)
+    assert axes.get_ylim()[0] == 0 and 9 < axes.get_ylim()[1] < 12
+
+
+def test_one_seed_has_no_band(tmp_path: Path, drawn: list[Axes]) -> None:
+    figures.grid(curve("task", "pcil", 1, 1, 2, 3), tmp_path / "grid")
+    assert not drawn[0].collections and drawn[0].get_title() == "task, 1 seed"
 
 
 def test_a_grid_tells_variants_and_tasks_apart(tmp_path: Path, drawn: list[Axes]) -> None:
     points = curve("a", "pcil", 1, 1) + curve("a", "pcil", 1, 2, variant="paper") + curve("a", "dac", 1, 3)
     points += [point for task in "bc" for point in curve(task, "dac", 1, 4, expert=None)]
     figures.grid(points, tmp_path / "grid", columns=2)
-    assert [axes.get_title() for axes in drawn if axes.axison] == ["a", "b", "c"] and len(drawn) == 4
-    names = {"pcil, default (1 seed)": [1], "pcil, paper (1 seed)": [2], "dac (1 seed)": [3], "expert 9": [9, 9]}
+    titles = ["a, 1 seed", "b, 1 seed", "c, 1 seed"]
+    assert [axes.get_title() for axes in drawn if axes.axison] == titles and len(drawn) == 4
+    names = {"pcil, default": [1], "pcil, paper": [2], "dac": [3], "demos": [9, 9]}
     assert lines(drawn[0]) == names
-    colours = {line.get_color() for line in drawn[0].lines if str(line.get_label()) in names}
-    assert len(colours) == 4
+    shown = [line for line in drawn[0].lines if str(line.get_label()) in names]
+    assert len({line.get_color() for line in shown}) == len({line.get_marker() for line in shown}) == 4
+    (legend,) = drawn[0].get_figure().legends
+    assert sorted(text.get_text() for text in legend.get_texts()) == sorted(names), "one legend for all panels"
+
+
+def test_health_is_drawn_where_it_is_known(tmp_path: Path, drawn: list[Axes]) -> None:
+    known = [point._replace(correlation=0.1 * i) for i, point in enumerate(curve("a", "pcil", 1, 1, 2, 3))]
+    figures.grid(known + curve("b", "bc", 1, 5, 6), tmp_path / "grid", value="correlation")
+    (axes,) = drawn
+    assert np.allclose(lines(axes)["pcil"], [0, 0.1, 0.2]) and "correlation" in axes.get_ylabel()
+    assert len(axes.lines) == 1, "one line: neither seeds nor demonstrations"
+
+
+def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) -> None:
+    """Four seeds with 0.5, 0.7, 0.3 and 1 of their experts at the end: without the lowest and the highest, 0.6."""
+    points = curve("a", "pcil", 1, 0, 5, expert=10.0) + curve("a", "pcil", 2, 0, 7, expert=10.0)
+    points += curve("b", "pcil", 1, 0, 6, expert=20.0) + curve("b", "pcil", 2, 0, 20, expert=20.0)
+    points += curve("c", "dac", 1, 3, 4, expert=None)
+    figures.aggregate(points, tmp_path / "all", figures.styles(points))
+    (axes,) = drawn
+    assert np.allclose(lines(axes)["pcil"], [0, 0.6]) and axes.get_title() == "2 tasks" and "dac" not in lines(axes)
+    assert np.allclose(axes.collections[0].get_datalim(axes.transData).intervaly, [0, 0.85])
+
+
+def test_without_an_expert_there_is_nothing_to_put_together(tmp_path: Path) -> None:
+    points = curve("a", "pcil", 1, 0, 5, expert=None)
+    assert figures.aggregate(points, tmp_path / "all", figures.styles(points)) == "" and not list(tmp_path.iterdir())
 
 
 def test_the_same_grid_is_the_same_file(tmp_path: Path) -> None:
     """Committed figures change only where their numbers do."""
-    points = curve("task", "pcil", 1, 1, 2, 3)
-    one, two = (figures.grid(points, tmp_path / name / "grid.png") for name in "ab")
-    assert one.read_bytes() == two.read_bytes()
-    pdf = one.with_suffix(".pdf").read_bytes()
-    assert pdf == two.with_suffix(".pdf").read_bytes() and b"CreationDate" not in pdf
+    points = curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6)
+    one, two = (figures.grid(points, tmp_path / name / "grid") for name in "ab")
+    assert one == two
+    for kind in ("png", "pdf"):
+        first, second = ((tmp_path / name / f"grid.{kind}").read_bytes() for name in "ab")
+        assert first == second and b"CreationDate" not in first
+
+
+# --- Looks ---
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of sRGB (WCAG 2)."""
+    channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_every_method_has_a_look_and_can_be_told_without_colour() -> None:
+    looks = [*figures.STYLES.values(), *figures.OTHERS]
+    assert set(figures.STYLES) >= set(presets.METHODS) | {"pwil", "sil", "tcn", "pcil-gail", "tcn-gail", "potil"}
+    assert len({look.marker for look in looks}) == len({look.colour for look in looks}) == len(looks)
+    assert len({look.dashes for look in figures.STYLES.values()}) == len(figures.STYLES)
+
+
+@pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.OTHERS)])
+def test_lines_stand_out_from_the_paper(colour: str) -> None:
+    assert 1.05 / (luminance(colour) + 0.05) > 3, "WCAG's least contrast of graphical objects"
+
+
+def test_a_look_does_not_depend_on_who_else_is_there() -> None:
+    everyone = [point for method in ("dac", "zzz", "pcil", "aaa") for point in curve("a", method, 1, 1)]
+    looks = figures.styles(everyone + curve("a", "pcil", 1, 1, variant="paper"))
+    assert looks["pcil", "default"] == figures.STYLES["pcil"] and looks["dac", "default"] == figures.STYLES["dac"]
+    assert len(set(looks.values())) == 5 and list(looks)[:3] == [("pcil", "default"), ("pcil", "paper"), ("dac", "default")]
+
+
+# --- Representations ---
+
+
+def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes]) -> None:
+    """A row a method, a column a task; one panel is missing; of two seeds the first is drawn."""
+
+    def transitions(task: str, method: str, seed: int, shift: float) -> list[Dot]:
+        head = (task, method, "default", seed, 5000)
+        return [
+            Dot(*head, None, 0.0, 0.5, shift, 0.0),
+            Dot(*head, 0.0, 1.0, 0.5, shift + 1, 1.0),
+            Dot(*head, 2.0, 3.0, 0.5, shift + 2, 3.0),
+        ]
+
+    dots = transitions("a", "dac", 1, 10) + transitions("a", "dac", 2, 50)
+    dots += transitions("a", "pcil", 1, 20) + transitions("b", "pcil", 1, 30)
+    figures.clouds(dots, tmp_path / "clouds")
+    panels = [axes for axes in drawn if axes.get_title()]
+    assert [axes.get_title().split(",")[:2] for axes in panels] == [["a", " dac"], ["a", " pcil"], ["b", " pcil"]]
+    agent, expert = panels[0].collections
+    assert np.asarray(agent.get_offsets()).tolist() == [[11, 1], [12, 3]]
+    assert np.asarray(expert.get_offsets()).tolist() == [[10, 0]]
+    assert agent.get_array().tolist() == [0, 2]
+    red, green, blue, _ = expert.get_facecolor()[0]
+    assert blue > green > red, "experts are blue"
+    low, high = figures.REWARD_COLOURS([0.0, 1.0])
+    assert low[1] > 2 * low[0] and low.sum() < high.sum() and min(high[:2]) > 0.8 > 0.3 > high[2], "dark green to yellow"

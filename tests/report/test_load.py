@@ -1,14 +1,18 @@
-"""Run folders to rows and back."""
+"""Run folders to rows and back; what is a run, which runs are seeds of one variant, and what is left out in words."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from fake_runs import fake_run, fake_sweep
+from pcil.config import MACHINE_SETTINGS
 from pcil.errors import InputError
-from pcil.report.load import Point, read_points, read_run, write_points
+from pcil.report import load
+from pcil.report.load import Dot, Point, collect, curves, flat, matrix, read_points, read_run, write_points
 
 
 def make_run(folder: Path) -> Path:
@@ -18,21 +22,47 @@ def make_run(folder: Path) -> Path:
     (folder / "run.json").write_text(json.dumps(about))
     rows = ["frames,episode,return,length,seconds", "0,0,1.0,500,0.1", "0,1,4.0,500,0.1", "20000,0,10.25,500,9.9"]
     (folder / "eval.csv").write_text("\n".join([*rows, "20000,1,10.75,500,9.9"]) + "\n")
+    health = ((1000, 0.5), (20000, 0.25), (20001, 9.0))
+    (folder / "train.jsonl").write_text("".join(f'{{"frames": {f}, "correlation": {c}}}\n' for f, c in health) + '{"frames": 2')
     return folder
 
 
 def test_each_evaluation_is_one_point(tmp_path: Path) -> None:
+    """The correlation is that of the episodes since the evaluation before; half a line of a killed run is none."""
     points = read_run(make_run(tmp_path / "run"))
     assert points == [
-        Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.46, "abc+"),
-        Point("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.46, "abc+"),
+        Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.46, "abc+", 0.1, None),
+        Point("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.46, "abc+", 9.9, 0.375),
     ]
 
 
-def test_points_survive_their_file(tmp_path: Path) -> None:
+def test_a_run_without_episodes_has_no_correlation(tmp_path: Path) -> None:
+    """Behavioural cloning plays none while it trains."""
+    folder = make_run(tmp_path / "run")
+    (folder / "train.jsonl").write_text('{"frames": 1000, "agent/loss": 1.0}\n')
+    assert {point.correlation for point in read_run(folder)} == {None}
+
+
+def test_rows_survive_their_file(tmp_path: Path) -> None:
     points = [*read_run(make_run(tmp_path / "run"), "warm"), Point("t", "expert", "default", 1, 0, 0.0, 0.0, 0.0, None, "")]
-    write_points(tmp_path / "results" / "x.csv", points)
-    assert read_points(tmp_path / "results" / "x.csv") == points
+    dots = [Dot("t", "dac", "paper", 2, 9, None, 0.1, -0.5, 1.0, 2.0), Dot("t", "dac", "paper", 2, 9, 1.5, 0.0, 1.0, 0.0, 0.0)]
+    for rows in (points, dots):
+        write_points(tmp_path / "results" / "x.csv", rows)
+        assert read_points(tmp_path / "results" / "x.csv") == rows
+
+
+def test_files_of_older_versions_are_read(tmp_path: Path) -> None:
+    write_points(tmp_path / "x.csv", points := read_run(make_run(tmp_path / "run")))
+    cut = [",".join(line.split(",")[:10]) for line in (tmp_path / "x.csv").read_text().splitlines()]
+    (tmp_path / "x.csv").write_text("\n".join(cut) + "\n")
+    assert read_points(tmp_path / "x.csv") == [point._replace(seconds=None, correlation=None) for point in points]
+
+
+@pytest.mark.parametrize("text", ["a,b\n1,2\n", "task,method\nx,y\n", "task,frames\nx,many\n", "\x00\x01\xff"])
+def test_a_file_of_something_else_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_bytes(text.encode("latin-1"))
+    with pytest.raises(InputError, match="is no file of results"):
+        read_points(tmp_path / "x.csv")
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
@@ -47,9 +77,100 @@ def test_a_run_without_demonstrations_has_no_expert(tmp_path: Path) -> None:
     assert {(point.expert_return, point.commit) for point in read_run(folder)} == {(None, "")}
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}"])
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"run": [], "demos": null, "commit": null}'])
 def test_a_damaged_description_is_refused(text: str, tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run")
     (folder / "run.json").write_text(text)
     with pytest.raises(InputError, match="holds no run"):
         read_run(folder)
+
+
+# --- Many runs ---
+
+
+def test_runs_are_found_at_any_depth_and_once(tmp_path: Path) -> None:
+    root = fake_sweep(tmp_path / "sweep")
+    found = collect([root, root / "walker_run", root / "walker_run" / "pcil-1"])
+    assert len(found.sources) == 12 and len(found.points) == 36 and found.notes == []
+    assert found.sources["walker_run", "pcil", "default", 2].folder == root / "walker_run" / "pcil-2"
+    assert found.sources["walker_run", "pcil", "default", 2].settings["agent.gamma"] == 0.99
+
+
+def test_the_order_of_the_paths_changes_nothing(tmp_path: Path) -> None:
+    root = fake_sweep(tmp_path)
+    one, two = (collect(sorted(root.glob("*/*"), reverse=reverse)).points for reverse in (False, True))
+    assert one == two
+    assert [name[:2] for name in curves(one)] == [(t, m) for t in ("hopper_stand", "walker_run") for m in ("pcil", "dac")]
+
+
+def test_a_csv_gives_the_same_points_as_its_runs(tmp_path: Path) -> None:
+    found = collect([fake_sweep(tmp_path / "sweep")])
+    write_points(tmp_path / "all.csv", found.points)
+    again = collect([tmp_path / "all.csv"])
+    assert again.points == found.points and again.sources == {}
+    assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).points == found.points, "no seed counts twice"
+
+
+def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path) -> None:
+    """What differs on one task names the variant on every task, so that variants can be compared over tasks."""
+    fake_run(tmp_path / "a", [1], seed=1, checkpoint_seconds=1)
+    fake_run(tmp_path / "b", [2], seed=2, checkpoint_seconds=2)
+    fake_run(tmp_path / "c", [3], seed=1, agent={"gamma": 0.9})
+    fake_run(tmp_path / "d", [4], "hopper_hop", n_step=1)
+    fake_run(tmp_path / "e", [5], method="dac", n_step=1)
+    by = {(point.task, point.method, point.variant, point.seed): point.return_mean for point in collect([tmp_path]).points}
+    assert by == {
+        ("walker_run", "pcil", "default, agent.gamma=0.99", 1): 1,
+        ("walker_run", "pcil", "default, agent.gamma=0.99", 2): 2,
+        ("walker_run", "pcil", "default, agent.gamma=0.9", 1): 3,
+        ("hopper_hop", "pcil", "default, agent.gamma=0.99", 1): 4,
+        ("walker_run", "dac", "default", 1): 5,
+    }
+
+
+def test_settings_of_the_machine_make_no_variant() -> None:
+    assert set(MACHINE_SETTINGS) <= set(load.NO_VARIANT)
+
+
+def test_the_same_run_twice_is_shown_once_and_said(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        fake_run(tmp_path / name, [1, 2])
+    found = collect([tmp_path])
+    assert len(found.points) == 2
+    assert found.notes == [f"{tmp_path / 'b'} holds the same run as {tmp_path / 'a'}, which is shown."]
+
+
+def test_what_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:
+    fake_run(tmp_path / "good", [1, 2])
+    fake_run(tmp_path / "young", [])
+    fake_run(tmp_path / "torn", [1]).joinpath("eval.csv").unlink()
+    found = collect([tmp_path])
+    assert [source.folder.name for source in found.sources.values()] == ["good"]
+    young, torn = sorted(found.notes, key=lambda note: "torn" in note)
+    assert "young has no evaluation yet" in young and "torn holds no run that can be read" in torn
+
+
+def test_without_any_run_the_reason_is_given(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="There is no run in"):
+        collect([tmp_path])
+    with pytest.raises(InputError, match="There is no run in nothing"):
+        collect([])
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        collect([tmp_path / "nowhere"])
+    fake_run(tmp_path / "young", [])
+    with pytest.raises(InputError, match="has no evaluation yet"):
+        collect([tmp_path])
+
+
+def test_a_matrix_has_the_frames_that_all_seeds_have(tmp_path: Path) -> None:
+    fake_run(tmp_path / "a", {0: 1, 1000: 2, 2000: 3}, correlation=[0.5, 0.6])
+    fake_run(tmp_path / "b", {0: 4, 2000: 5, 3000: 6}, seed=2, correlation=[0.7, 0.8])
+    (runs,) = curves(collect([tmp_path]).points).values()
+    frames, values = matrix(runs)
+    assert frames.tolist() == [0, 2000] and values.tolist() == [[1, 3], [4, 5]]
+    frames, values = matrix(runs, "correlation")
+    assert frames.tolist() == [2000] and np.allclose(values, [[0.6], [0.7]])
+
+
+def test_nested_settings_are_flat_by_their_dotted_names() -> None:
+    assert flat({"a": 1, "b": {"c": {"d": None}, "e": "x"}}) == {"a": 1, "b.c.d": None, "b.e": "x"}

@@ -1,28 +1,67 @@
-"""Learning curves, from files alone."""
+"""Learning curves and pictures of representations, from rows of results alone; each as PNG and PDF."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import io
+import re
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 
-from pcil.report.load import Point, read_run
+from pcil.report import stats
+from pcil.report.load import Dot, Point, curves, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
 
-INK, GREY = "#1b1b1b", "#808080"
-COLOURS = {
-    "pcil": "#a60628",  # the paper's legend, appendix
-    "dac": "#348abd",
-    "pwil": "#467821",
-    "sil": "#d55e00",
-    "bc": "#7a68a6",
-    "expert": GREY,
+matplotlib.rcParams["svg.hashsalt"] = "pcil"  # the same figure is the same file
+INK, GREY, BLUE = "#1b1b1b", "#808080", "#1f5fbf"
+REWARD_COLOURS = LinearSegmentedColormap.from_list("reward", ["#0b3d1e", "#3f9b3a", "#ffe135"])
+"""The paper's Figure 4: dark green for a low true reward, yellow for a high one."""
+
+
+class Style(NamedTuple):
+    """How a method looks on every figure; its marker and dashes are its own, for those who do not see its colour."""
+
+    colour: str
+    marker: str
+    dashes: tuple[float, ...] = ()
+
+
+STYLES = {
+    "pcil": Style("#a60628", "o"),  # colours of the first five and of the expert: the paper's legend, Figure 3
+    "dac": Style("#348abd", "s", (6, 2)),
+    "pwil": Style("#467821", "^", (6, 2, 1.5, 2)),
+    "sil": Style("#d55e00", "D", (2, 1.5)),
+    "bc": Style("#7a68a6", "v", (9, 3)),
+    "potil": Style("#8c6d00", "P", (4, 1.5, 1, 1.5, 1, 1.5)),
+    "tcn": Style("#00847e", "X", (4, 4)),
+    "pcil-gail": Style("#d14d9b", "<", (8, 2, 2, 2)),
+    "tcn-gail": Style("#5b4636", ">", (1, 2)),
+    "expert": Style(GREY, "*", (3, 1, 1, 1)),
 }
+OTHERS = [Style(INK, "p"), Style("#0000c8", "h", (5, 2)), Style("#7f7f00", "d", (3, 2)), Style("#b000b0", "8", (7, 3, 1, 3))]
+"""Methods that are not ours, in the order of their names; and variants of a method after its first."""
+
+
+def styles(rows: Iterable[Point | Dot]) -> dict[tuple[str, str], Style]:
+    """A look for each method and variant: the method's own, and another one for each further variant of it."""
+    found: dict[tuple[str, str], Style] = {}
+    spare = 0
+    order = {method: place for place, method in enumerate(STYLES)}
+    for method, variant in sorted({row[1:3] for row in rows}, key=lambda name: (order.get(name[0], len(order)), name)):
+        if method in STYLES and method not in {name for name, _ in found}:
+            found[method, variant] = STYLES[method]
+        else:
+            found[method, variant] = OTHERS[spare % len(OTHERS)]
+            spare += 1
+    return found
 
 
 def run_curve(folder: Path, expert_return: float | None) -> Path:
@@ -32,68 +71,176 @@ def run_curve(folder: Path, expert_return: float | None) -> Path:
     frames = [point.frames for point in points]
     figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
     low, high = [point.return_low for point in points], [point.return_high for point in points]
-    colour = COLOURS.get(method, INK)
+    colour = STYLES.get(method, OTHERS[0]).colour
     axis.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
     axis.plot(frames, [point.return_mean for point in points], color=colour, marker="o", markersize=3, label="mean")
+    shown = low + high
     if expert_return is not None:
-        axis.axhline(expert_return, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert_return:.0f}")
-    _finish(axis, f"{task} - {method} ({preset}, seed {seed})")
+        shown.append(_expert(axis, expert_return))
+    _finish(axis, f"{task} - {method} ({preset}, seed {seed})", "return", shown)
+    axis.legend(frameon=False, fontsize=8)
     path = folder / "curve.png"
     figure.savefig(path, dpi=150)
     plt.close(figure)
     return path
 
 
-def grid(points: Sequence[Point], path: Path, columns: int = 3) -> Path:
-    """A panel for each task: the mean over seeds of each method and variant, every seed behind it, and the expert's return.
+def grid(
+    points: Sequence[Point],
+    path: Path,
+    columns: int = 3,
+    value: str = "return_mean",
+    looks: dict[tuple[str, str], Style] | None = None,
+) -> str:
+    """A panel for each task: mean over seeds of each method with Student's 95% interval, every seed behind it, the expert.
 
-    Written as PNG and PDF; returns the PNG's path.
+    `value` is the column that is drawn; seeds and expert only for returns. PNG and PDF are written to `path`, SVG is returned.
     """
+    looks = looks or styles(points)
+    points = [point for point in points if getattr(point, value) is not None]
     tasks = list(dict.fromkeys(point.task for point in points))
-    columns = min(columns, len(tasks))
-    rows = -(-len(tasks) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4.4 * columns, 3.2 * rows), layout="constrained", squeeze=False)
-    for axis in axes.flat[len(tasks) :]:
-        axis.axis("off")
-    for axis, task in zip(axes.flat, tasks, strict=False):
-        _panel(axis, task, [point for point in points if point.task == task])
+    figure, axes = _axes(len(tasks), columns)
+    for axis, task in zip(axes, tasks, strict=True):
+        mine = curves(point for point in points if point.task == task)
+        shown = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
+        for name in (name for name in looks if (task, *name) in mine):
+            _seeds(axis, mine[task, *name], value, looks[name], _label(name, looks))
+        if value == "return_mean":
+            experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
+            shown += [_expert(axis, expert) for expert in experts if expert is not None]
+        ylabel = {"return_mean": "return", "correlation": "correlation with true reward"}[value]
+        _finish(axis, f"{task}, {_span('seed', mine)}", ylabel, shown)
+    return save(figure, path)
+
+
+def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], Style]) -> str:
+    """Share of the expert's return over frames: IQM over all seeds of all tasks of a method, with its bootstrap interval.
+
+    Nothing is drawn, and "" returned, where no task's expert is known.
+    """
+    strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
+    for name, runs in curves(points).items():
+        frames, returns = matrix(runs)
+        if (share := stats.share_of_expert(runs, returns)) is not None:
+            strata.setdefault(name[1:], []).append((frames, share))
+    if not strata:
+        return ""
+    figure, (axis,) = _axes(1, 1)
+    shown = [1.0]
+    for name in (name for name in looks if name in strata):
+        tasks = strata[name]
+        frames = np.array(sorted(set.intersection(*(set(own.tolist()) for own, _ in tasks))))
+        scores = [share[:, np.isin(own, frames)] for own, share in tasks]
+        _line(axis, frames, stats.iqm(*scores), stats.bootstrap(stats.iqm, scores), looks[name], _label(name, looks))
+        shown += stats.iqm(*scores).tolist()
+    _expert(axis, 1.0)
+    _finish(axis, _span("task", strata), "share of expert (IQM)", shown)
+    return save(figure, path)
+
+
+def clouds(dots: Sequence[Dot], path: Path, columns: int | None = None) -> str:
+    """t-SNE of each method's representation: the first seed's transitions; by default a row a method and a column a task."""
+    first: dict[tuple[str, ...], list[Dot]] = {name: seeds[0] for name, seeds in curves(dots).items()}
+    tasks, methods = (list(dict.fromkeys(name[part] for name in first)) for part in (slice(1), slice(1, 3)))
+    figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
+    for axis, name in zip(axes, ((*task, *method) for method in methods for task in tasks), strict=True):
+        if name in first:
+            _cloud(axis, first[name])
+        else:
+            axis.axis("off")
+    return save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> str:
+    """Write PNG and PDF without a date, close the figure, and return it as SVG; one legend for all panels stands below."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    lines = {str(line.get_label()): line for axis in figure.axes for line in axis.lines}
+    lines = {name: line for name, line in lines.items() if not name.startswith("_")}
+    if lines:
+        fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of the words and of a line
+        look = {"ncols": max(min(fitting, len(lines)), 1), "frameon": False, "fontsize": 8}
+        figure.legend(lines.values(), lines, loc="outside lower center", **look)
     figure.savefig(path.with_suffix(".png"), dpi=130)
     figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None}, dpi=130)
     plt.close(figure)
-    return path.with_suffix(".png")
+    return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())  # 0.01 pt is enough
 
 
-def _panel(axis: Axes, task: str, points: Sequence[Point]) -> None:
-    variants = list(dict.fromkeys((point.method, point.variant) for point in points))
-    methods = [method for method, _ in variants]
-    for index, (method, variant) in enumerate(variants):
-        alone = methods.count(method) == 1
-        colour = COLOURS.get(method, INK) if alone else plt.get_cmap("tab10")(index)
-        mine = [point for point in points if (point.method, point.variant) == (method, variant)]
-        _seeds(axis, mine, colour, method if alone else f"{method}, {variant}")
-    for expert in {point.expert_return for point in points if point.expert_return is not None}:
-        axis.axhline(expert, color=GREY, linestyle="--", linewidth=1, label=f"expert {expert:.0f}")
-    _finish(axis, task)
+def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels; what is left of the last row is empty."""
+    columns = min(columns, panels)
+    rows = -(-panels // columns)
+    options = {"layout": "constrained", "squeeze": False}
+    figure, axes = plt.subplots(rows, columns, figsize=(size[0] * columns, size[1] * rows), **options)
+    for axis in axes.flat[panels:]:
+        axis.axis("off")
+    return figure, list(axes.flat)[:panels]
 
 
-def _seeds(axis: Axes, points: Sequence[Point], colour: object, name: str) -> None:
-    """Each seed as a thin line, and their mean as far as the shortest reaches."""
-    seeds = list(dict.fromkeys(point.seed for point in points))
-    curves = [[(p.frames, p.return_mean) for p in points if p.seed == seed] for seed in seeds]
-    for curve in curves:
-        axis.plot(*zip(*curve, strict=True), color=colour, alpha=0.4, linewidth=0.8)
-    shortest = min(len(curve) for curve in curves)
-    mean = np.mean([[value for _, value in curve[:shortest]] for curve in curves], axis=0)
-    plural = "s" if len(seeds) > 1 else ""
-    label = f"{name} ({len(seeds)} seed{plural})"
-    axis.plot([frames for frames, _ in curves[0][:shortest]], mean, color=colour, linewidth=1.8, label=label)
+def _seeds(axis: Axes, runs: Sequence[Sequence[Point]], value: str, style: Style, name: str) -> None:
+    """Each seed's return as a thin line, and their mean with its interval at the frames that all of them have."""
+    for run in runs if value == "return_mean" else ():
+        axis.plot([p.frames for p in run], [getattr(p, value) for p in run], color=style.colour, alpha=0.35, linewidth=0.7)
+    frames, values = matrix(runs, value)
+    if len(frames):
+        middle = [stats.mean_interval(column) for column in values.T]
+        ends = np.array([(interval.low, interval.high) for interval in middle]).T
+        _line(axis, frames, np.array([interval.value for interval in middle]), ends, style, name)
 
 
-def _finish(axis: Axes, title: str) -> None:
-    axis.set(title=title, xlabel="frames (environment control steps)", ylabel="return")
-    if axis.dataLim.y0 >= 0:  # most tasks' returns; some Gymnasium environments pay less than nothing
-        axis.set_ylim(bottom=0)
+def _line(
+    axis: Axes, frames: np.ndarray, middle: np.ndarray, ends: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
+) -> None:
+    """One method: its line with a few markers, in a band where there is one."""
+    if np.isfinite(ends[0]).all():
+        axis.fill_between(frames, ends[0], ends[1], color=style.colour, alpha=0.15, linewidth=0)
+    every = max(len(frames) // 6, 1)
+    dashes = (0, style.dashes) if style.dashes else "-"
+    look = {"color": style.colour, "linestyle": dashes, "marker": style.marker, "markersize": 5, "markevery": every}
+    axis.plot(frames, middle, linewidth=1.8, label=label, **look)
+
+
+def _cloud(axis: Axes, dots: Sequence[Dot]) -> None:
+    """The agent's transitions coloured by reward, the expert's above them in blue."""
+    expert, agent = ([dot for dot in dots if (dot.reward is None) == own] for own in (True, False))
+    shared = {"s": 12, "linewidths": 0, "rasterized": True}
+    rewards = np.array([dot.reward for dot in agent], np.float64)
+    seen = axis.scatter([dot.x for dot in agent], [dot.y for dot in agent], c=rewards, cmap=REWARD_COLOURS, **shared)
+    axis.scatter([dot.x for dot in expert], [dot.y for dot in expert], color=BLUE, marker="^", **shared)
+    bar = axis.figure.colorbar(seen, ax=axis, label="true reward of the agent", shrink=0.8)
+    assert bar.solids is not None
+    bar.solids.set_rasterized(True)
+    axis.set(xticks=[], yticks=[])
+    task, method, variant, seed, frames = dots[0][:5]
+    axis.set_title(f"{task}, {method}, {variant}\nseed {seed}, {frames:,} frames", fontsize=8)
+
+
+def _expert(axis: Axes, value: float) -> float:
+    """A line at what the expert has, with its number at the right end; returns the value."""
+    axis.axhline(value, color=GREY, linestyle="--", linewidth=1, label="demos")
+    where = {"xycoords": ("axes fraction", "data"), "xytext": (4, 0), "textcoords": "offset points"}
+    axis.annotate(f"{value:.0f}", (1, value), fontsize=7, color=INK, va="center", **where)
+    return value
+
+
+def _span(word: str, groups: Mapping[Any, Sized]) -> str:
+    """How many of something the groups have, such as "2 to 3 seeds"."""
+    counts = sorted({len(group) for group in groups.values()})
+    return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
+
+
+def _label(name: tuple[str, str], looks: dict[tuple[str, str], Style]) -> str:
+    """The method, and its variant where there are several of it."""
+    return name[0] if [method for method, _ in looks].count(name[0]) == 1 else ", ".join(name)
+
+
+def _finish(axis: Axes, title: str, ylabel: str, shown: Sequence[float]) -> None:
+    """Words, and limits that hold every value of `shown`; a wide band may reach beyond them."""
+    low, high = min(shown), max(shown)
+    room = 0.08 * (high - low) or 1
+    axis.set(title=title, xlabel="frames (environment control steps)", ylabel=ylabel)
+    axis.set_ylim(0 if low >= 0 else low - room, high + room)  # most returns; some environments pay less than nothing
     axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3), useMathText=True)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.legend(frameon=False, fontsize=8)

@@ -105,3 +105,10 @@ class DAC(Reward):
     ) -> Float[Array, " T"]:
         del key
         return state.discriminator(self.seen(obs, action, embed))[:, 0]
+
+    def representation(
+        self, state: DiscriminatorState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T hidden"]:
+        """The discriminator's last hidden layer (paper section 4.3)."""
+        whole = state.discriminator
+        return jax.nn.relu(MLP(whole.weights[:-1], whole.biases[:-1])(self.seen(obs, action, embed)))

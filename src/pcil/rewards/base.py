@@ -117,6 +117,13 @@ class Reward(abc.ABC):
         del obs, action, embed, key
         return state
 
+    def representation(
+        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T dim"] | None:
+        """Where the reward has put `T` steps, if it learns a representation; given what `reward` is given."""
+        del state, obs, action, embed
+        return None
+
 
 def states_read(settings: Reward, obs: Float[Array, "*batch states obs"]) -> Float[Array, "*batch n obs"]:
     """The states that a reward `reads`, one a step."""

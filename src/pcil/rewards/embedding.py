@@ -77,19 +77,24 @@ def advance(
     return EmbeddingState(encoder, moments, reference, classifier), metrics
 
 
+def embedding(state: EmbeddingState, obs: Float[Array, "T obs"], embed: Embed) -> Float[Array, "T dim"]:
+    """`Phi(s)`, on the unit sphere."""
+    return unit_sphere(state.encoder(embed(obs)))
+
+
 def embedding_reward(
     state: EmbeddingState, obs: Float[Array, "T obs"], embed: Embed, compare: Literal["random", "mean"]
 ) -> Float[Array, " T"]:
     """The head's reward: the similarity, or `log D - log(1 - D)`, which is the classifier's logit itself."""
     if state.classifier is not None:
-        return state.classifier.linear(unit_sphere(state.encoder(embed(obs))))[:, 0]
-    both = unit_sphere(state.encoder(embed(jnp.concatenate([state.reference, obs]))))
+        return state.classifier.linear(embedding(state, obs, embed))[:, 0]
+    both = embedding(state, jnp.concatenate([state.reference, obs]), embed)
     expert, agent = jnp.split(both, [state.reference.shape[0]])
     return similarity(agent, expert, compare)
 
 
 def similarity(
-    embedding: Float[Array, "T dim"], expert: Float[Array, "batch dim"], how: Literal["random", "mean"]
+    embedded: Float[Array, "T dim"], expert: Float[Array, "batch dim"], how: Literal["random", "mean"]
 ) -> Float[Array, " T"]:
     """The reward `Phi(s) . Phi(s_E)`, in [-1, 1] for unit embeddings (Eq. 2).
 
@@ -97,6 +102,6 @@ def similarity(
     expert sample (authors' code: train.py); "mean" compares with the rows' mean (paper, Appendix B: "similar performance").
     """
     if how == "mean":
-        return embedding @ jnp.mean(expert, axis=0)
-    rows = jnp.arange(embedding.shape[0]) % expert.shape[0]
-    return jnp.sum(embedding * expert[rows], axis=-1)
+        return embedded @ jnp.mean(expert, axis=0)
+    rows = jnp.arange(embedded.shape[0]) % expert.shape[0]
+    return jnp.sum(embedded * expert[rows], axis=-1)

@@ -20,7 +20,7 @@ from pcil.losses import gradient_penalty, group_info_nce, info_nce, interpolate
 from pcil.networks import MLP, unit_sphere
 from pcil.optimiser import adam_count
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding_reward, init_embedding
+from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch, Window
 
 
@@ -115,6 +115,12 @@ class PCIL(Reward):
     ) -> Float[Array, " T"]:
         del action, key
         return embedding_reward(state, obs, embed, self.compare)
+
+    def representation(
+        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T dim"]:
+        del action
+        return embedding(state, obs, embed)
 
 
 def derangement(key: PRNGKeyArray, size: int) -> Array:

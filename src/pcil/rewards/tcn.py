@@ -19,7 +19,7 @@ from pcil.errors import check_ranges
 from pcil.losses import contrast, off_diagonal
 from pcil.networks import MLP, unit_sphere
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding_reward, init_embedding
+from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch, Window
 
 
@@ -98,3 +98,9 @@ class TCN(Reward):
     ) -> Float[Array, " T"]:
         del action, key
         return embedding_reward(state, obs, embed, self.compare)
+
+    def representation(
+        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
+    ) -> Float[Array, "T dim"]:
+        del action
+        return embedding(state, obs, embed)

@@ -1,0 +1,49 @@
+"""Policies at work, as short animations, where the machine can render."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from pcil import envs, seeds
+from pcil.policy import load_policy
+from pcil.report.load import Collection
+from pcil.seeds import Stream
+
+
+def films(found: Collection) -> dict[str, bytes]:
+    """An animation by the first seed of each task, method and variant, under a title; one note of those that can't be made."""
+    first = {name[:3]: name for name in sorted(found.sources, reverse=True)}
+    made: dict[str, bytes] = {}
+    refused: list[Exception] = []
+    for name in sorted(first.values()):
+        try:
+            made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder)
+        except Exception as error:  # whatever OpenGL raises where it does not work
+            refused.append(error)
+    if refused:
+        found.notes.append(f"{len(refused)} of {len(first)} animations are left out: {refused[0]}")
+    return made
+
+
+def film(folder: Path, steps: int = 160, every: int = 4) -> bytes:
+    """The first agent steps of an evaluation episode of a run's policy, every so many a picture: an animated WebP."""
+    from PIL import Image
+
+    policy = load_policy(folder)
+    env = envs.make(policy.task, render_mode="rgb_array")
+    obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
+    frames, over = [], False
+    while not over and len(frames) * every < steps:
+        frames.append(Image.fromarray(np.asarray(env.render())))
+        for _ in range(every):
+            if not over:
+                obs, _, terminated, truncated, _ = env.step(policy(obs))
+                over = terminated or truncated
+    milliseconds = round(1000 * every / env.unwrapped.metadata.get("render_fps", 30))
+    env.close()
+    file = io.BytesIO()
+    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, quality=50)
+    return file.getvalue()

@@ -1,0 +1,69 @@
+"""The report: tables, figures, and a page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from jinja2 import Environment
+
+from pcil.report import figures, tables
+from pcil.report.load import Collection, write_points
+
+
+def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
+    """Write `index.html`, `figures/` and `tables/` into `out`, and return the page's path.
+
+    `films` are animations (WebP) by their title. The same input gives the same files.
+    """
+    (out / "tables").mkdir(parents=True, exist_ok=True)
+    written = {name: table for name, make in tables.MAKERS.items() if (table := make(found)).rows}
+    for name, table in written.items():
+        tables.write(name, table, out / "tables")
+    write_points(out / "tables" / "evaluations.csv", found.points)
+    if found.dots:
+        write_points(out / "tables" / "transitions.csv", found.dots)
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["cell"] = tables.cell
+    page = environment.from_string(Path(__file__).with_name("page.html").read_text()).render(
+        tasks=list(dict.fromkeys(point.task for point in found.points)),
+        methods=list(dict.fromkeys(point.method for point in found.points)),
+        found=found,
+        last={point[:4]: point for point in found.points},
+        tables=[(name, *tables.words(tables.MAKERS[name]), table) for name, table in written.items()],
+        figures=draw(found, out / "figures"),
+        films={title: _uri("webp", film) for title, film in films.items()},
+    )
+    (out / "index.html").write_text(page)
+    return out / "index.html"
+
+
+def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
+    """Every figure into `folder`; for the page, by heading and then by title, as data URIs."""
+    points, looks = found.points, figures.styles(found.points)
+    svg: dict[str, dict[str, str]] = {"Learning curves": {}}
+    figures.grid(points, folder / "curves", looks=looks)  # all tasks on one sheet, as papers print it
+    for task in dict.fromkeys(point.task for point in points):
+        path = folder / f"curves-{_plain(task)}"
+        svg["Learning curves"][task] = figures.grid([p for p in points if p.task == task], path, looks=looks)
+    if together := figures.aggregate(points, folder / "aggregate", looks):
+        svg["Learning curves"]["all tasks"] = together
+    if any(point.correlation is not None for point in points):
+        svg["Reward health"] = {"all": figures.grid(points, folder / "health", value="correlation", looks=looks)}
+    if found.dots:
+        figures.clouds(found.dots, folder / "representation")
+    for task in dict.fromkeys(dot.task for dot in found.dots):
+        path, mine = folder / f"representation-{_plain(task)}", [dot for dot in found.dots if dot.task == task]
+        svg.setdefault("t-SNE", {})[task] = figures.clouds(mine, path, columns=2)
+    return {heading: {title: _uri("svg+xml", t.encode()) for title, t in drawn.items()} for heading, drawn in svg.items()}
+
+
+def _plain(task: str) -> str:
+    """A task's name as part of a file's."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", task)
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

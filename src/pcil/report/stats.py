@@ -1,0 +1,93 @@
+"""What a few seeds say: means and interquartile means with 95% intervals, probability of improvement, sample efficiency.
+
+`strata` are the scores of one method: an array for each task, whose first axis is the seed. A bootstrap draws seeds with
+replacement within each task and never mixes tasks (Agarwal et al. 2021).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from pcil.report.load import Point
+
+LEVEL = 0.95
+RESAMPLES = 2000
+
+
+class Interval(NamedTuple):
+    """A value and the ends of its 95% interval, which are NaN where a single seed says nothing of the spread."""
+
+    value: float
+    low: float
+    high: float
+
+    def overlaps(self, other: Interval) -> bool | None:
+        """Whether the two share a point; None where one of them is unknown."""
+        if any(map(math.isnan, (*self, *other))):
+            return None
+        return self.low <= other.high and other.low <= self.high
+
+
+def mean_interval(scores: Sequence[float] | np.ndarray) -> Interval:
+    """The mean over seeds and Student's interval, which holds for few seeds if their scores are normal."""
+    deviation = float(np.std(scores, ddof=1)) if len(scores) > 1 else math.nan
+    return student(float(np.mean(scores)), deviation, len(scores))
+
+
+def student(mean: float, deviation: float, seeds: int) -> Interval:
+    """Student's interval from a mean and a sample standard deviation over seeds, as papers print them."""
+    half = float(stats.t.ppf((1 + LEVEL) / 2, seeds - 1)) * deviation / math.sqrt(seeds) if seeds > 1 else math.nan
+    return Interval(mean, mean - half, mean + half)
+
+
+def iqm(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Interquartile mean of all scores together: the mean without the lowest and highest quarter; of three, it is the mean."""
+    return np.asarray(stats.trim_mean(np.concatenate(strata, axis=axis), 0.25, axis=axis))
+
+
+def iqm_interval(strata: Sequence[np.ndarray]) -> Interval:
+    """The IQM of final scores `[seeds]`, with its bootstrap interval."""
+    return Interval(float(iqm(*strata)), *map(float, bootstrap(iqm, strata)))
+
+
+def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Interval:
+    """Chance that a run of ours beats one of theirs on the same task, a tie being half; the mean over tasks."""
+
+    def chance(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
+        moved = [np.moveaxis(scores, axis, -1) for scores in strata]
+        pairs = zip(moved[: len(ours)], moved[len(ours) :], strict=True)
+        wins = [(1 + np.sign(x[..., :, None] - y[..., None, :])).mean(axis=(-2, -1)) / 2 for x, y in pairs]
+        return np.asarray(np.mean(wins, axis=0))
+
+    both = [*ours, *theirs]
+    return Interval(float(chance(*both)), *map(float, bootstrap(chance, both)))
+
+
+def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the percentile interval of `statistic(*strata, axis=...)`; trailing axes of the strata go along.
+
+    Every call draws the same. NaN where a task has one seed, for then nobody knows how much its score varies.
+    """
+    if min(map(len, strata)) < 2:
+        nothing = np.full(strata[0].shape[1:], math.nan)
+        return nothing, nothing
+    options = {"n_resamples": RESAMPLES, "confidence_level": LEVEL, "method": "percentile", "rng": np.random.default_rng(0)}
+    low, high = stats.bootstrap(strata, statistic, vectorized=True, axis=0, **options).confidence_interval
+    return np.asarray(low), np.asarray(high)
+
+
+def share_of_expert(runs: Sequence[Sequence[Point]], scores: np.ndarray) -> np.ndarray | None:
+    """Scores, one row a run, in units of the demonstrations' return; None where that is unknown or not positive."""
+    experts = np.array([run[-1].expert_return or 0 for run in runs])
+    return None if experts.min() <= 0 else (scores.T / experts).T
+
+
+def first_reach(run: Sequence[Point], share: float) -> Point | None:
+    """The first evaluation at which a run has this share of its expert's return, if there is one."""
+    reached = (point for point in run if point.return_mean >= share * (point.expert_return or math.inf) > 0)
+    return next(reached, None)

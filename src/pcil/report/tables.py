@@ -1,0 +1,208 @@
+"""Tables of a set of runs: CSV with every number, Markdown and HTML to be read. Each maker's docstring is its table's note."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pcil.report import stats
+from pcil.report.embedding import measures
+from pcil.report.load import Collection, Point, curves, matrix
+from pcil.report.stats import Interval
+
+PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
+    "pcil": ((964.2, 24.2), (778.4, 14.1), (771.2, 142.1), (43.2, 20.1)),
+    "tcn": ((975.2, 45.1), (180.5, 11.4), (2.0, 1.2), (6.8, 0.2)),
+    "pcil-gail": ((2.5, 2.4), (18.5, 6.5), (1.2, 1.8), (0.1, 0.1)),
+    "tcn-gail": ((35.4, 19.2), (19.8, 4.2), (1.5, 0.3), (17.3, 4.6)),
+}
+PAPER_TASKS = ("finger_spin", "walker_run", "hopper_stand", "hopper_hop")
+PAPER_SEEDS = 3
+SHARES = (0.5, 0.8, 0.9)
+"""Of the expert's return, to which the way is measured."""
+KEY = ("task", "method", "variant")
+
+
+class Table(NamedTuple):
+    """A header and rows of words, numbers, `Interval`s and None; empty where there is nothing to say."""
+
+    header: tuple[str, ...]
+    rows: list[tuple[Any, ...]]
+
+
+def finals(found: Collection) -> Table:
+    """Final return of each task: mean over seeds at the last evaluation that all of them have, with Student's 95% interval.
+
+    sd is the sample standard deviation. The interquartile mean (IQM) has a bootstrap interval; of three seeds the IQM is the
+    mean, and a bootstrap of three is too narrow.
+    """
+    rows = []
+    for name, runs in curves(found.points).items():
+        frames, final = _final(runs)
+        share = stats.share_of_expert(runs, final)
+        spread = float(np.std(final, ddof=1)) if len(final) > 1 else None
+        expert = runs[0][-1].expert_return, None if share is None else float(share.mean())
+        ours = stats.mean_interval(final), spread, stats.iqm_interval([final])
+        rows.append((*name, *ours, *expert, len(final), frames))
+    return Table((*KEY, "mean", "sd", "IQM", "expert", "of expert", "seeds", "frames"), rows)
+
+
+def paper(found: Collection) -> Table:
+    """Beside the paper's numbers: its Table 1, mean and standard deviation over 3 seeds after 2,000,000 frames.
+
+    Its interval is Student's from those, as ours is. Mind the frames of ours.
+    """
+    rows = []
+    for (task, method, variant), runs in curves(found.points).items():
+        if task in PAPER_TASKS and method in PAPER:
+            frames, final = _final(runs)
+            published = stats.student(*PAPER[method][PAPER_TASKS.index(task)], PAPER_SEEDS)
+            ours = stats.mean_interval(final)
+            overlap = {True: "yes", False: "no", None: None}[ours.overlaps(published)]
+            difference = ours.value - published.value
+            rows.append((task, method, variant, ours, published, difference, overlap, len(final), frames))
+    return Table((*KEY, "ours", "paper", "difference", "intervals overlap", "seeds", "frames"), rows)
+
+
+def aggregate(found: Collection) -> Table:
+    """All tasks together: final return as a share of the demonstrations', over all seeds of all tasks of a method.
+
+    The intervals are a bootstrap's that draws seeds within each task. Compare methods only where they have the same tasks.
+    """
+    rows = []
+    for name, tasks in _by_method(found.points, stats.share_of_expert).items():
+        scores = list(tasks.values())
+        ends = map(float, stats.bootstrap(_mean_of_tasks, scores))
+        mean = Interval(float(_mean_of_tasks(*scores)), *ends)
+        rows.append((*name, mean, stats.iqm_interval(scores), len(tasks), sum(map(len, scores))))
+    return Table(("method", "variant", "mean", "IQM", "tasks", "runs"), rows)
+
+
+def efficiency(found: Collection) -> Table:
+    """Sample efficiency: the first evaluation at which a seed has 50, 80 and 90% of the demonstrations' return.
+
+    How many seeds got there, and the median over all seeds, which is blank where half of them did not. Minutes are wall-clock
+    time since the run began: core-minutes where each run has one core, as in a sweep.
+    """
+    rows = []
+    for name, runs in curves(found.points).items():
+        row: list[Any] = [*name]
+        for reached in ([stats.first_reach(run, share) for run in runs] for share in SHARES):
+            frames = np.median([point.frames if point else math.inf for point in reached])
+            minutes = np.median([(point.seconds or math.nan) / 60 if point else math.inf for point in reached])
+            row += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
+            row.append(sum(point is not None for point in reached))
+        if stats.share_of_expert(runs, np.zeros(len(runs))) is not None:
+            rows.append((*row, len(runs)))
+    words = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
+    return Table((*KEY, *words, "seeds"), rows)
+
+
+def improvement(found: Collection) -> Table:
+    """Probability of improvement: the chance that a run of the first method ends above one of the second.
+
+    On the same task, a tie being half; the mean over the tasks that both have, with a bootstrap interval.
+    """
+    rows = []
+    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points, lambda runs, final: final).items(), 2):
+        if shared := [task for task in x if task in y]:
+            chance = stats.probability_of_improvement([x[task] for task in shared], [y[task] for task in shared])
+            rows.append((*ours, *theirs, chance, len(shared)))
+    return Table(("method", "variant", "over method", "over variant", "probability", "tasks"), rows)
+
+
+def health(found: Collection) -> Table:
+    """Health of the learned reward: its correlation with the true one over the steps of a training episode.
+
+    Mean over the episodes of each half of the run, with Student's interval over seeds. The task's own reward has 1.
+    """
+    rows = []
+    for name, runs in curves(found.points).items():
+        frames, correlation = matrix(runs, "correlation")
+        if len(frames) > 1:
+            halves = np.array_split(correlation, 2, axis=1)
+            rows.append((*name, *(stats.mean_interval(half.mean(axis=1)) for half in halves), len(runs)))
+    return Table((*KEY, "first half", "second half", "seeds"), rows)
+
+
+def representation(found: Collection) -> Table:
+    """Representation: how well distance to the experts tells the true reward, and whether the experts are one cluster.
+
+    Both in the representation itself, not in its picture. Spearman's rank correlation of an agent transition's distance to
+    the experts' mean with its reward is -1 where distance tells all. The experts' mean silhouette is 1 where they lie together,
+    apart from the agent, and 0 or less where they are scattered among its transitions.
+    """
+    rows = []
+    for name, seeds in curves(found.dots).items():
+        columns: list[Any] = []
+        for values in zip(*map(measures, seeds), strict=True):
+            each = ", ".join(f"{dots[0].seed}: {value:.2f}" for dots, value in zip(seeds, values, strict=True))
+            columns += [stats.mean_interval(values), each]
+        rows.append((*name, *columns))
+    return Table((*KEY, "Spearman", "Spearman of each seed", "silhouette", "silhouette of each seed"), rows)
+
+
+Maker = Callable[[Collection], Table]
+MAKERS: dict[str, Maker] = {
+    make.__name__: make for make in (aggregate, finals, paper, efficiency, improvement, health, representation)
+}
+
+
+def words(make: Maker) -> tuple[str, str]:
+    """Title and note of a maker's table."""
+    title, _, note = " ".join((make.__doc__ or "").split()).partition(": ")
+    return title, note[:1].upper() + note[1:]
+
+
+def cell(value: Any) -> str:
+    """A cell as people read it: one decimal from 10 on, two below."""
+    if isinstance(value, Interval):
+        return cell(value.value) + ("" if math.isnan(value.low) else f" [{cell(value.low)}, {cell(value.high)}]")
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.1f}" if abs(value) >= 9.995 else f"{value:.2f}"
+    return f"{value:,}" if isinstance(value, int) else value or ""
+
+
+def markdown(table: Table) -> str:
+    """The table alone, with a line break at its end."""
+    rows = [table.header, ["---"] * len(table.header), *(map(cell, row) for row in table.rows)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def write(name: str, table: Table, folder: Path) -> None:
+    """`<name>.md` with title and note, and `<name>.csv`, where an interval has three columns."""
+    title, note = words(MAKERS[name])
+    (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}")
+    wide = [isinstance(value, Interval) for value in table.rows[0]]
+    header = [(name, f"{name} low", f"{name} high") if w else (name,) for name, w in zip(table.header, wide, strict=True)]
+    with (folder / f"{name}.csv").open("w", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(itertools.chain(*header))
+        for row in table.rows:
+            flat = itertools.chain(*(value if isinstance(value, Interval) else (value,) for value in row))
+            rows.writerow([round(value, 6) if isinstance(value, float) else value for value in flat])
+
+
+def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:
+    """The last frames at which every seed was evaluated, and the returns `[seeds]` there."""
+    frames, returns = matrix(runs)
+    return int(frames[-1]), returns[:, -1]
+
+
+def _by_method(points: Sequence[Point], score: Callable[..., np.ndarray | None]) -> dict[Any, dict[str, np.ndarray]]:
+    """Final scores by method and variant, then by task."""
+    found: dict[Any, dict[str, np.ndarray]] = {}
+    for (task, *name), runs in curves(points).items():
+        if (scores := score(runs, _final(runs)[1])) is not None:
+            found.setdefault(tuple(name), {})[task] = scores
+    return found
+
+
+def _mean_of_tasks(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
+    return np.asarray(np.mean([scores.mean(axis=axis) for scores in strata], axis=0))

@@ -1,0 +1,40 @@
+"""`pcil report`: what lies below some folders, what its networks show, and a page of it all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pcil import film, representation
+from pcil.errors import InputError
+
+
+def report(
+    paths: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DIR ...", help_behavior_hint="")],
+    /,
+    out: Path,
+    rollouts: bool = True,
+) -> int:
+    """Draw figures, tables and a page from runs.
+
+    Args:
+        paths: Run folders, folders that hold some at any depth, or files like results/*.csv.
+        out: The report's folder, with index.html, figures and tables.
+        rollouts: Play an episode with the networks of each run: their representation, and an animation of each method.
+    """
+    try:
+        from pcil.report import load, page
+    except ImportError as error:
+        raise InputError(f"A report needs {error.name}, which pip install 'pcil[report]' brings.") from error
+    found = load.collect(paths)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
+    if rollouts:
+        representation.add(found)
+    films = film.films(found) if rollouts else {}
+    print("\n".join([*found.notes, f"Report: {page.build(found, out, films)}"]))
+    return 0

@@ -1,0 +1,86 @@
+"""Rows of the representations that rewards have learned: the networks of a run folder on transitions of expert and agent."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pcil import compilation, envs, learner, loop, presets, runs, seeds
+from pcil.config import Run
+from pcil.errors import InputError
+from pcil.report.embedding import project
+from pcil.report.load import Collection, Dot, Point, Source, flat, place
+from pcil.rewards import Reward
+from pcil.seeds import Stream
+from pcil.types import Episode
+
+EXPERT_STEPS, AGENT_STEPS = 128, 256
+"""As many transitions as the paper's Figure 4 has."""
+_NEVER = 2**62
+
+
+def add(found: Collection) -> None:
+    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not."""
+    compilation.use_cache()
+    refused: list[Exception] = []
+    for name, source in found.sources.items():
+        last = [point for point in found.points if point[:4] == name][-1]
+        try:
+            found.dots.extend(transitions(source, last))
+        except (InputError, ImportError) as error:
+            refused.append(error)
+    found.dots.sort(key=place)
+    if refused:
+        found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
+
+
+def transitions(source: Source, row: Point) -> list[Dot]:
+    """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
+
+    Empty where the run's reward has no representation; `InputError` where it can't be restored.
+    """
+    run = restored(source.settings)
+    if type(run.reward).representation is Reward.representation:
+        return []
+    demos, env = runs.demonstrations(run), envs.make(run.task)
+    assert demos is not None
+    try:
+        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
+    except ValueError as error:
+        raise InputError(f"the checkpoint of {source.folder} is of another version ({error}).") from error
+    if not state.counters.episodes:
+        raise InputError(f"{source.folder} holds no checkpoint that can be read.")
+    rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
+    frames = state.counters.frames
+    episode = loop.play(dataclasses.replace(run, update_every=_NEVER), env, envs.spec(env), state)
+    embed = learner.frozen_embed(run.learner, state.learner.agent)
+    seen = []
+    for episodes, rows in ((demos.episodes, EXPERT_STEPS), ([episode], AGENT_STEPS)):
+        obs, action, reward = _steps(run, episodes, rows, rng)
+        embedded = run.reward.representation(state.learner.reward, jnp.asarray(obs), jnp.asarray(action), embed)
+        seen.append((np.asarray(embedded), reward))
+    (expert, _), (agent, reward) = seen
+    return project(expert, agent, reward, row._replace(frames=frames))
+
+
+def restored(settings: dict[str, Any]) -> Run:
+    """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
+    given = {name: value for name, value in settings.items() if not name.endswith(".class")}
+    run = presets.make(**given)
+    if flat(json.loads(json.dumps(run.to_json()))) != settings:
+        raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
+    return run
+
+
+def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """So many random steps, none twice: the states that the reward reads, the actions, the environment's rewards."""
+    episodes = [episode.absorbed() if run.agent.absorbing else episode for episode in episodes]
+    part = slice(1, None) if run.reward.reads == "next_obs" else slice(None, -1)
+    kinds = zip(*((episode.obs[part], episode.action, episode.reward) for episode in episodes), strict=True)
+    chosen = rng.permutation(sum(map(len, episodes)))[:rows]
+    return tuple(np.concatenate(arrays)[chosen] for arrays in kinds)

@@ -1,0 +1,167 @@
+"""Statistics against published numbers, second implementations, exact enumeration, and their laws."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import hypothesis.extra.numpy as arrays
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import ttest_1samp
+
+from fake_runs import fake_run
+from pcil.report import stats
+from pcil.report.load import read_run
+from pcil.report.stats import Interval
+
+law = settings(deadline=None, derandomize=True, max_examples=50)
+RUNS_BY_TASKS = np.array([[1, 2], [2, 2], [1, 1], [2, 1]], float)
+OTHERS = np.array([[1, 1], [2, 2], [3, 3]], float)
+scores = arrays.arrays(np.float64, st.integers(2, 9), elements=st.integers(-50, 50).map(float))
+tasks = st.lists(scores, min_size=1, max_size=3)
+
+
+def naive_iqm(values: list[float]) -> float:
+    """Sort, leave out the lowest and the highest quarter (rounded down), and average the rest."""
+    cut = len(values) // 4
+    kept = sorted(values)[cut : len(values) - cut]
+    return sum(kept) / len(kept)
+
+
+def naive_probability(ours: list[np.ndarray], theirs: list[np.ndarray]) -> float:
+    """Count pairs, task by task."""
+    chances = []
+    for x, y in zip(ours, theirs, strict=True):
+        pairs = [1.0 if a > b else 0.5 if a == b else 0.0 for a in x for b in y]
+        chances.append(sum(pairs) / len(pairs))
+    return sum(chances) / len(chances)
+
+
+def test_the_published_numbers() -> None:
+    """Agarwal et al. 2021 test their library with these."""
+    assert stats.iqm_interval(list(RUNS_BY_TASKS.T)).value == 1.5
+    assert stats.probability_of_improvement(list(RUNS_BY_TASKS.T), list(OTHERS.T)).value == pytest.approx(1 / 3)
+
+
+@law
+@given(tasks)
+def test_the_iqm_is_the_naive_one(strata: list[np.ndarray]) -> None:
+    assert stats.iqm(*strata) == pytest.approx(naive_iqm([value for task in strata for value in task.tolist()]))
+
+
+@law
+@given(scores, st.floats(0.1, 5), st.floats(-5, 5))
+def test_the_iqm_moves_with_its_scores_and_lies_among_them(x: np.ndarray, scale: float, shift: float) -> None:
+    assert stats.iqm(scale * x + shift) == pytest.approx(scale * stats.iqm(x) + shift, abs=1e-9)
+    assert x.min() <= stats.iqm(x) <= x.max()
+    assert len(x) > 3 or stats.iqm(x) == pytest.approx(x.mean())
+
+
+def test_the_iqm_does_not_see_one_outlier() -> None:
+    assert stats.iqm(np.array([1.0, 2.0, 3.0, 1e9])) == 2.5
+
+
+@settings(law, max_examples=15)
+@given(st.data())
+def test_the_probability_is_the_naive_one_and_complements(data: st.DataObject) -> None:
+    ours = data.draw(tasks)
+    theirs = [data.draw(scores) for _ in ours]
+    interval = stats.probability_of_improvement(ours, theirs)
+    assert interval.value == pytest.approx(naive_probability(ours, theirs))
+    assert interval.value + stats.probability_of_improvement(theirs, ours).value == pytest.approx(1)
+    assert 0 <= interval.low <= interval.high <= 1
+    bent = stats.probability_of_improvement([np.arctan(x) for x in ours], [np.arctan(y) for y in theirs])
+    assert bent == pytest.approx(interval), "only the order of the scores counts"
+
+
+# --- Student's interval ---
+
+
+@law
+@given(scores.filter(lambda x: np.ptp(x) > 0))
+def test_the_interval_of_the_mean_is_scipys(x: np.ndarray) -> None:
+    oracle = ttest_1samp(x, 0).confidence_interval(0.95)
+    assert stats.mean_interval(x) == pytest.approx((x.mean(), *oracle))
+
+
+def test_three_seeds_by_hand() -> None:
+    """t(0.975, 2) = 4.302653; the standard deviation of 100, 200, 300 is 100."""
+    assert stats.mean_interval([100.0, 200.0, 300.0]) == pytest.approx((200, 200 - 248.414, 200 + 248.414), abs=1e-3)
+    assert stats.student(964.2, 24.2, 3) == pytest.approx((964.2, 904.084, 1024.316), abs=1e-3)
+
+
+def test_it_covers_the_truth_as_often_as_it_says() -> None:
+    draws = np.random.default_rng(0).normal(5, 2, (3000, 3))
+    covered = np.mean([i.low <= 5 <= i.high for i in map(stats.mean_interval, draws)])
+    assert 0.94 < covered < 0.96
+
+
+def test_one_seed_has_no_interval() -> None:
+    for interval in (stats.mean_interval([7.0]), stats.iqm_interval([np.array([7.0])])):
+        assert interval.value == 7 and math.isnan(interval.low) and math.isnan(interval.high)
+    alone = stats.probability_of_improvement([np.array([7.0])], [np.array([1.0, 2.0])])
+    assert alone.value == 1 and math.isnan(alone.low)
+
+
+def test_overlap() -> None:
+    one = Interval(2, 1, 3)
+    assert one.overlaps(Interval(5, 3, 7)) and Interval(5, 3, 7).overlaps(one) and one.overlaps(Interval(2, 1.9, 2.1))
+    assert one.overlaps(Interval(5, 3.01, 7)) is False and Interval(5, 3.01, 7).overlaps(one) is False
+    assert one.overlaps(Interval(2, math.nan, math.nan)) is None
+
+
+# --- The bootstrap ---
+
+
+def test_the_bootstrap_draws_seeds_within_their_task() -> None:
+    """Without strata the IQM of these would vary from 0 to 100."""
+    apart = [np.zeros(5), np.full(5, 100.0)]
+    assert stats.iqm_interval(apart) == (50, 50, 50)
+
+
+def test_the_bootstrap_is_that_of_all_possible_draws() -> None:
+    """Every one of the 3^3 x 2^2 equally likely draws is made by hand."""
+    strata = [np.array([1.0, 4.0, 10.0]), np.array([20.0, 50.0])]
+    draws = itertools.product(itertools.product(strata[0], repeat=3), itertools.product(strata[1], repeat=2))
+    exact = np.array([naive_iqm([*a, *b]) for a, b in draws])
+    value, low, high = stats.iqm_interval(strata)
+    assert value == pytest.approx(naive_iqm([1, 4, 10, 20, 50]))
+    for end, level in ((low, 0.025), (high, 0.975)):  # up to what 2000 random draws of the 108 leave open
+        assert np.mean(exact < end - 1e-9) - 0.01 < level < np.mean(exact <= end + 1e-9) + 0.01
+    assert stats.iqm_interval(strata) == stats.iqm_interval(strata), "the same numbers give the same interval"
+
+
+def test_each_column_of_a_curve_has_its_own_interval() -> None:
+    strata = [np.random.default_rng(i).normal(size=(4, 6)) for i in range(3)]
+    low, high = stats.bootstrap(stats.iqm, strata)
+    for k in range(6):
+        alone = stats.iqm_interval([x[:, k] for x in strata])
+        assert (low[k], high[k]) == pytest.approx(alone[1:], abs=0.05)
+        assert alone.value == pytest.approx(stats.iqm(*strata)[k])
+    assert all(np.isnan(end).all() and end.shape == (6,) for end in stats.bootstrap(stats.iqm, [strata[0], strata[1][:1]]))
+
+
+# --- Against the expert ---
+
+
+def test_the_way_to_a_share_of_the_expert_is_the_first_evaluation_there(tmp_path: Path) -> None:
+    run = read_run(fake_run(tmp_path / "run", [0, 390, 450, 300, 640], expert=800))
+    reached = [stats.first_reach(run, share) for share in (0.5, 0.8, 0.9)]
+    assert [point and (point.frames, point.seconds) for point in reached] == [(2000, 60.0), (4000, 120.0), None]
+
+
+@pytest.mark.parametrize("expert", [None, 0.0, -100.0])
+def test_where_the_expert_has_nothing_there_is_no_share(expert: float | None, tmp_path: Path) -> None:
+    run = read_run(fake_run(tmp_path / "run", [-200, -50], expert=expert))
+    assert stats.first_reach(run, 0.5) is None
+    assert stats.share_of_expert([run], np.array([[1.0, 2.0]])) is None
+
+
+def test_each_seed_is_measured_by_its_own_expert(tmp_path: Path) -> None:
+    runs = [read_run(fake_run(tmp_path / str(expert), [1], expert=expert)) for expert in (100.0, 200.0)]
+    share = stats.share_of_expert(runs, np.array([[50.0, 100.0], [50.0, 100.0]]))
+    assert share is not None and share.tolist() == [[0.5, 1.0], [0.25, 0.5]]

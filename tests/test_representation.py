@@ -1,0 +1,188 @@
+"""Representations of trained runs: the right layer of the right networks on the right transitions; folders stay untouched."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pcil import learner, representation, runs, seeds
+from pcil.config import Run
+from pcil.demos import Demonstrations
+from pcil.errors import InputError
+from pcil.report.load import Collection, collect, flat
+from pcil.rewards import DAC, PCIL
+from pcil.types import Episode
+from small import narrow, random_batch, save_point_mass_demos, small_run
+
+
+def embed(obs: Any) -> Any:
+    """Features that are the observations."""
+    return obs
+
+
+# --- The layer ---
+
+
+def test_pcils_representation_is_what_its_reward_compares() -> None:
+    settings, demos = narrow(PCIL(compare="mean")), random_batch(50, 3, 2)
+    state, steps = settings.init([demos], embed, key=jax.random.key(0)), random_batch(40, 3, 2, seed=1)
+    seen = settings.representation(state, jnp.asarray(steps.obs), jnp.asarray(steps.action), embed)
+    anchors = settings.representation(state, state.reference, jnp.zeros((32, 2)), embed)
+    reward = settings.reward(state, jnp.asarray(steps.obs), jnp.asarray(steps.action), embed, key=jax.random.key(1))
+    assert seen.shape == (40, 4) and np.allclose(np.linalg.norm(seen, axis=1), 1, atol=1e-5)
+    assert np.allclose(seen @ anchors.mean(axis=0), reward, atol=1e-5)
+
+
+@pytest.mark.parametrize("inputs", ["state", "state-action"])
+def test_dacs_representation_is_one_linear_layer_from_its_logit(inputs: str) -> None:
+    settings, demos = narrow(DAC(inputs=inputs)), random_batch(50, 3, 2)
+    state, steps = settings.init([demos], embed, key=jax.random.key(0)), random_batch(40, 3, 2, seed=1)
+    obs, action = jnp.asarray(steps.obs), jnp.asarray(steps.action)
+    seen = settings.representation(state, obs, action, embed)
+    last = state.discriminator
+    logit = (seen @ last.weights[-1])[:, 0] + last.biases[-1]
+    assert seen.shape == (40, 16) and float(seen.min()) == 0 < float(seen.max())
+    assert np.allclose(logit, settings.reward(state, obs, action, embed, key=jax.random.key(1)), atol=1e-5)
+
+
+# --- Whole runs ---
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of PCIL, one of DAC and one on the task's own reward."""
+    root = tmp_path_factory.mktemp("runs")
+    demos = save_point_mass_demos(root / "demos")
+    for method in ("pcil", "dac", "expert"):
+        runs.execute(small_run(method, demos=demos if method != "expert" else None), root / method, runs.Silent())
+    return root
+
+
+@pytest.fixture
+def found(trained: Path) -> Collection:
+    return collect([trained])
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_rows_are_added_for_every_run_that_has_a_representation(trained: Path, found: Collection) -> None:
+    """128 transitions of the expert and 50 of the agent, whose episodes have no more; the task's reward learns nothing."""
+    before = files(trained)
+    representation.add(found)
+    assert files(trained) == before and found.notes == []
+    assert [dot.method for dot in found.dots] == ["pcil"] * 178 + ["dac"] * 178
+    for method in ("pcil", "dac"):
+        mine = [dot for dot in found.dots if dot.method == method]
+        assert sum(dot.reward is None for dot in mine) == 128 and {dot.frames for dot in mine} == {300}
+    again = collect([trained])
+    representation.add(again)
+    assert again.dots == found.dots
+
+
+def test_the_transitions_are_those_of_the_newest_networks(
+    trained: Path, found: Collection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The distances follow from the finished run's own state; nothing learns while the episode is played."""
+    kept: dict[str, Any] = {}
+    plain = representation.loop.play
+
+    def watched(run: Run, env: Any, spec: Any, state: Any) -> Episode:
+        kept["state"], kept["episode"] = state, plain(run, env, spec, state)
+        return kept["episode"]
+
+    monkeypatch.setattr(representation.loop, "play", watched)
+    monkeypatch.setattr(learner, "update", lambda *arguments: pytest.fail("an update"))
+    name = ("toy/point_mass-v0", "pcil", "default", 1)
+    dots = representation.transitions(found.sources[name], next(point for point in found.points if point[:4] == name))
+    state, run = kept["state"].learner, small_run(demos=str(trained / "demos" / "point_mass-v0"))
+    assert kept["state"].counters.updates == json.loads((trained / "pcil/train.jsonl").read_text().splitlines()[-1])["updates"]
+
+    def look(obs: np.ndarray) -> np.ndarray:
+        trunk = learner.frozen_embed(run.learner, state.agent)
+        return np.asarray(run.reward.representation(state.reward, jnp.asarray(obs), jnp.zeros((len(obs), 2)), trunk))
+
+    rng = seeds.rng(run.seed, seeds.Stream.SAMPLE, kept["state"].counters.episodes - 1)
+    states = np.concatenate([episode.obs[1:] for episode in Demonstrations.load(run.demos).episodes])
+    expert = look(states[rng.permutation(len(states))[:128]])
+    order = rng.permutation(50)
+    agent = look(kept["episode"].obs[1:][order])
+    distances = np.linalg.norm(np.concatenate([expert, agent]) - expert.mean(axis=0), axis=1)
+    assert [dot.distance for dot in dots] == pytest.approx(distances.tolist(), rel=1e-3, abs=1e-5)
+    assert [dot.reward for dot in dots[128:]] == pytest.approx(kept["episode"].reward[order].tolist(), rel=1e-3)
+
+
+def test_a_run_is_made_again_from_its_description(trained: Path) -> None:
+    for method in ("pcil", "dac", "expert"):
+        settings = json.loads((trained / method / "run.json").read_text())["run"]
+        run = representation.restored(flat(settings))
+        assert run.method == method and json.loads(json.dumps(run.to_json())) == settings
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"reward": {"class": "os:system"}},
+        {"reward": {"novel": 1}},
+        {"method": "os:system"},
+        {"agent": {"gamma": 7.0}},
+    ],
+)
+def test_what_is_not_ours_is_never_made(change: dict[str, Any], trained: Path, tmp_path: Path) -> None:
+    """A description from elsewhere runs no code: its class must be the one that our own preset makes."""
+    folder = Path(shutil.copytree(trained / "pcil", tmp_path / "pcil"))
+    about = json.loads((folder / "run.json").read_text())
+    for name, value in change.items():
+        about["run"][name] = about["run"][name] | value if isinstance(value, dict) else value
+    (folder / "run.json").write_text(json.dumps(about))
+    found = collect([folder])
+    representation.add(found)
+    assert found.dots == [] and len(found.notes) == 1 and "1 of 1 runs is left out" in found.notes[0]
+
+
+@pytest.mark.parametrize("damage", ["gone", "torn", "narrow"])
+def test_a_run_without_its_networks_is_left_out_and_said(damage: str, trained: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(trained / "pcil", tmp_path / "pcil"))
+    if damage == "gone":
+        shutil.rmtree(folder / "checkpoint")
+    elif damage == "torn":
+        for file in folder.glob("checkpoint/*/meta.json"):
+            file.write_text("1\n{}\n")
+    else:
+        about = json.loads((folder / "run.json").read_text())
+        about["run"]["reward"]["hidden"] = 12
+        (folder / "run.json").write_text(json.dumps(about))
+    found = collect([folder])
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        representation.add(found)
+    assert said.getvalue() == "" and found.dots == []
+    assert found.notes[0].startswith("The representation of 1 of 1 runs is left out: ")
+    with pytest.raises(InputError):
+        representation.transitions(next(iter(found.sources.values())), found.points[-1])
+
+
+def test_no_step_is_drawn_twice_and_each_keeps_its_reward() -> None:
+    """Two episodes of 4 and 3 steps; states, actions and rewards carry their own number."""
+
+    def numbered(first: int, steps: int) -> Episode:
+        numbers = np.arange(first, first + steps, dtype=np.float32)
+        return Episode(np.arange(first - 1, first + steps, dtype=np.float32)[:, None], numbers[:, None], numbers, False)
+
+    run = small_run()
+    obs, action, reward = representation._steps(run, [numbered(1, 4), numbered(11, 3)], 100, np.random.default_rng(0))
+    assert sorted(reward.tolist()) == [1, 2, 3, 4, 11, 12, 13] and reward.tolist() != sorted(reward.tolist())
+    assert obs[:, 0].tolist() == action[:, 0].tolist() == reward.tolist(), "the state that the step led to"
+    paired = dataclasses.replace(run, reward=narrow(DAC(inputs="state-action")))
+    obs, action, _ = representation._steps(paired, [numbered(1, 4)], 2, np.random.default_rng(0))
+    assert len(obs) == 2 and (obs + 1 == action).all(), "the state in which the action was taken"

@@ -208,7 +208,9 @@ def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) 
 def test_every_option_in_the_docs_is_one() -> None:
     known = set(re.findall(r"--[a-z][\w.-]*", (ROOT / "docs" / "cli.md").read_text()))
     for page in PAGES:
-        for line in re.findall(r"^.*\bpcil (?:train|evaluate|demos|record|bench|doctor)\b.*$", page.read_text(), re.MULTILINE):
+        for line in re.findall(
+            r"^.*\bpcil (?:train|evaluate|demos|record|sweep|bench|doctor)\b.*$", page.read_text(), re.MULTILINE
+        ):
             assert set(re.findall(r"(?<!\S)--[a-z][\w.-]*\w", line)) <= known, line
 
 

@@ -26,7 +26,7 @@ LAYERS = [
     "losses optimiser networks noise",
     "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
-    "bench doctor arguments cli",
+    "bench doctor arguments sweep cli",
 ]
 """A part imports from its own layer and those above it in this list; `report` stands aside."""
 LAYER = {part: depth for depth, parts in enumerate(LAYERS) for part in parts.split()}

@@ -110,6 +110,13 @@ def test_further_runs_have_from_the_file_what_they_do_not_give() -> None:
     assert (job.name, job.run.frames, job.run.agent.gamma, job.run.agent.tau) == ("finger_spin/expert/7", 5000, 0.8, 0.5)
 
 
+def test_the_examples_of_the_docs_are_sweeps() -> None:
+    first, second = re.findall(r"^```toml\n(.*?)^```$", (ROOT / "docs" / "sweeps.md").read_text(), re.MULTILINE | re.DOTALL)
+    names = [job.name for job in plan(first).jobs]
+    assert len(names) == 2 * 2 * 2 * 3 + 1 and names[-1] == "pendulum_swingup/expert/1"
+    assert [job.name.split("/")[1] for job in plan(second).jobs] == ["pcil-plain"] * 3 + ["oracle"] * 3
+
+
 def test_a_file_may_hold_nothing_but_further_runs() -> None:
     (job,) = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [3]").jobs
     assert job.name == "pendulum_swingup/expert/3"

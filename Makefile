@@ -10,7 +10,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml uv.lock
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --inexact --quiet
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --extra sweep --inexact --quiet
 	touch $(STAMP)
 
 train: $(STAMP)

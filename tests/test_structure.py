@@ -27,10 +27,10 @@ LAYERS = [
     "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
     "representation film reporting",
-    "bench doctor arguments cli",
+    "bench doctor arguments plans sweep cli",
 ]
 """A part imports from its own layer and those above it in this list; `report` stands aside, for `REPORTERS` alone."""
-REPORTERS = {"cli", "representation", "film", "reporting"}
+REPORTERS = {"plans", "cli", "representation", "film", "reporting"}
 LAYER = {part: depth for depth, parts in enumerate(LAYERS) for part in parts.split()}
 LOADERS = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 """Modules that run code out of a file which they read."""

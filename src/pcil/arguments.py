@@ -1,15 +1,20 @@
 """From the words of a command to a function's arguments, by `tyro`; what does not fit is one sentence, not a framed box."""
 
-from __future__ import annotations
-
 import contextlib
+import dataclasses
 import functools
+import importlib
 import io
 import re
+import sys
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pcil.errors import InputError
+
+if TYPE_CHECKING:
+    from pcil.config import Run
 
 
 def call(name: str, function: Callable[..., int], words: list[str]) -> int:
@@ -35,6 +40,56 @@ def call(name: str, function: Callable[..., int], words: list[str]) -> int:
             return 0
         raise InputError(f"{_complaint(box.getvalue())}; pcil {name} --help tells more.") from None
     return bound()
+
+
+def train(words: list[str], execute: Callable[["Run", Path], int]) -> int:
+    """Call `execute` with the run and the folder that the words of `pcil train` give."""
+    import tyro
+
+    from pcil import envs, presets
+    from pcil.config import Run
+
+    given = peek(words)
+    task = envs.task_name(given.get("task", "walker_walk"))
+    changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
+    if "reward" in given:
+        changes["reward"] = _load_reward(given["reward"])
+        words = without(words, "reward")
+    default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
+    if "reward" in given and "method" not in given:
+        default = dataclasses.replace(default, method=given["reward"])  # its results go by its own name
+    if "task" not in given and not {"-h", "--help"} & set(words):
+        raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
+
+    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default) -> int:
+        """Train a policy, or resume where a run stopped.
+
+        The settings shown are those of the chosen method and preset. --reward my.module:MyReward takes a reward of your own
+        in place of the method's.
+
+        Args:
+            out: The run's folder; one that holds the same run resumes it.
+        """
+        return execute(dataclasses.replace(run, task=task), out)
+
+    return call("train", train, words)
+
+
+def _load_reward(spec: str) -> Any:
+    """An instance of the reward class that `module:Class` names."""
+    from pcil.rewards import Reward
+
+    module, _, name = spec.partition(":")
+    sys.path.insert(0, "")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+        if not (isinstance(kind, type) and issubclass(kind, Reward)):
+            raise TypeError(f"{name} is no subclass of pcil.Reward")
+        return kind()
+    except Exception as error:  # the module is a person's own and may raise anything
+        raise InputError(
+            f"--reward {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like my.module:MyReward."
+        ) from error
 
 
 def peek(words: list[str]) -> dict[str, str]:

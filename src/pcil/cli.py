@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"pcil: {sentence.removesuffix('.')}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = "; the same command goes on from the last checkpoint" if words[0] == "train" else ""
+        again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -50,37 +50,7 @@ def _overview() -> str:
 
 def _train(words: list[str]) -> int:
     """Train a policy, or resume where a run stopped."""
-    import dataclasses
-
-    import tyro
-
-    from pcil import envs, presets
-    from pcil.config import Run
-
-    given = arguments.peek(words)
-    task = envs.task_name(given.get("task", "walker_walk"))
-    changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
-    if "reward" in given:
-        changes["reward"] = _load_reward(given["reward"])
-        words = arguments.without(words, "reward")
-    default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
-    if "reward" in given and "method" not in given:
-        default = dataclasses.replace(default, method=given["reward"])  # its results go by its own name
-    if "task" not in given and not {"-h", "--help"} & set(words):
-        raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
-
-    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default) -> int:
-        """Train a policy, or resume where a run stopped.
-
-        The settings shown are those of the chosen method and preset. --reward my.module:MyReward takes a reward of your own
-        in place of the method's.
-
-        Args:
-            out: The run's folder; one that holds the same run resumes it.
-        """
-        return _run(dataclasses.replace(run, task=task), out)
-
-    return arguments.call("train", train, words)
+    return arguments.train(words, _run)
 
 
 def _run(run: "Run", out: Path) -> int:
@@ -119,23 +89,6 @@ def _shipped_return(task: str) -> float | None:
     from pcil.demos import shipped
 
     return {row["task"]: row["return_mean"] for row in shipped()}.get(task)
-
-
-def _load_reward(spec: str) -> Any:
-    """An instance of the reward class that `module:Class` names."""
-    from pcil.rewards import Reward
-
-    module, _, name = spec.partition(":")
-    sys.path.insert(0, "")
-    try:
-        kind = getattr(importlib.import_module(module), name)
-        if not (isinstance(kind, type) and issubclass(kind, Reward)):
-            raise TypeError(f"{name} is no subclass of pcil.Reward")
-        return kind()
-    except Exception as error:  # the module is a person's own and may raise anything
-        raise InputError(
-            f"--reward {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like my.module:MyReward."
-        ) from error
 
 
 def _evaluate(words: list[str]) -> int:
@@ -279,6 +232,30 @@ def _report(words: list[str]) -> int:
     return arguments.call("report", report, words)
 
 
+def _sweep(words: list[str]) -> int:
+    """Train every run of a file, side by side."""
+
+    def sweep(file: Path, /, out: Path, jobs: int | None = None, address: str | None = None) -> int:
+        """Train every run of a file, side by side; the same command skips what is done and resumes the rest.
+
+        Exit code 1 says that a run failed; the others were finished all the same.
+
+        Args:
+            file: The runs, in TOML; docs/sweeps.md says how.
+            out: Each run's folder is OUT/TASK/METHOD/SEED.
+            jobs: Runs at the same time; by default as many as there are cores for.
+            address: A Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine, and stopped at the end.
+        """
+        from rich.console import Console
+
+        from pcil import sweep
+
+        _at_least(1, jobs=1 if jobs is None else jobs)
+        return sweep.sweep(file, out, jobs, address, Console(file=sys.stdout))
+
+    return arguments.call("sweep", sweep, words)
+
+
 def _bench(words: list[str]) -> int:
     """Measure the speed of each part, and its ratio to the floor."""
 
@@ -344,6 +321,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "record": _record,
     "theory": _theory,
     "report": _report,
+    "sweep": _sweep,
     "bench": _bench,
     "doctor": _doctor,
 }

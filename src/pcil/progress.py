@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
+from datetime import timedelta
 from types import FrameType
 from typing import Any
 
@@ -19,11 +21,13 @@ class _TimeLeft(ProgressColumn):
     """Time left at the speed since the bar began; a resumed run's head start does not count as speed."""
 
     def render(self, task: Task) -> Text:
-        rate = task.fields["rate"]
-        if not rate or task.total is None:
-            return Text("--:-- left", style="progress.remaining")
-        left = max(int((task.total - task.completed) / rate), 0)  # the last episode may go past the end
-        return Text(f"{left // 60:d}:{left % 60:02d} left", style="progress.remaining")
+        left = time_left((task.total or 0) - task.completed, task.fields["rate"])
+        return Text(f"{left} left", style="progress.remaining")
+
+
+def time_left(frames: float | int, rate: float) -> str:
+    """How long so many frames take at a speed; the last episode may go past the end, and then it is no time."""
+    return f"{timedelta(seconds=int(max(frames, 0) / rate))}" if rate > 0 else "-:--:--"
 
 
 def compared(value: float, expert: float) -> str:
@@ -32,11 +36,34 @@ def compared(value: float, expert: float) -> str:
     return f"{share}the expert's {expert:.1f}"
 
 
+class Signals:
+    """While it is entered, the first Ctrl-C or SIGTERM is kept and answered; a second Ctrl-C stops at once."""
+
+    def __init__(self, answer: Callable[[], None]) -> None:
+        self.number: int | None = None
+        self._answer = answer
+
+    def __enter__(self) -> Signals:
+        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self.number is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.number = number
+        self._answer()
+
+
 class Bar:
     """Reports a run to the terminal. Ctrl-C or SIGTERM ends it after the episode at hand; a second Ctrl-C at once."""
 
     def __init__(self, console: Console, expert_return: float | None) -> None:
-        self.signal: int | None = None
+        self._signals = Signals(self._stopping)
         self.evaluations: list[tuple[int, float]] = []
         self._expert = expert_return
         self._began: tuple[float, int] | None = None
@@ -53,14 +80,18 @@ class Bar:
         self._task = self._progress.add_task("starting", total=None, amount="", returns="", rate=0.0)
 
     def __enter__(self) -> Bar:
-        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._signals.__enter__()
         self._progress.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._progress.stop()
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        self._signals.__exit__()
+
+    @property
+    def signal(self) -> int | None:
+        """The one that has asked to stop."""
+        return self._signals.number
 
     def episode(self, run: Run, frames: int, total_reward: float) -> None:
         """Advance the bar; the speed is measured from the first episode of this session, compilation left out."""
@@ -95,9 +126,5 @@ class Bar:
         last = f"return {total_reward:.0f}"
         return f"{last} of {self._expert:.0f}" if self._expert is not None else last
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        del frame
-        if self.signal is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self.signal = number
+    def _stopping(self) -> None:
         self.say("Stopping after this episode; Ctrl-C again stops at once and loses what came since the last checkpoint.")

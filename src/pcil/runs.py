@@ -119,31 +119,46 @@ def _claimed(folder: Path) -> Iterator[None]:
         yield
 
 
+def check(run: Run, folder: Path) -> None:
+    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
+    identity = _identity(run, demonstrations(run))
+    if (folder / "run.json").exists():
+        _refuse_another(folder, identity)
+
+
+def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
+    """What must be equal in a folder's `run.json` for this run to go on there, as JSON gives it back."""
+    about = demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean}
+    return json.loads(json.dumps({"run": run.to_json(), "demos": about}))
+
+
 def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: loop.Reporter) -> None:
     """Write `run.json`, or check that the one which is there describes this very run."""
-    about = {
-        "run": run.to_json(),
-        "demos": demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean},
-        "versions": {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "commit": commit(),
-    }
-    about = json.loads(json.dumps(about))
+    identity = _identity(run, demos)
+    versions = {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()}
     path = folder / "run.json"
     if not path.exists():
-        _write(path, json.dumps(about, indent=2) + "\n")
+        _write(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
         return
+    before = _refuse_another(folder, identity)
+    updated = differences(before.get("versions", {}), versions)
+    if updated and not (folder / "DONE").exists():
+        reporter.say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
+
+
+def _refuse_another(folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
+    """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
-        before = json.loads(path.read_text())
-        changed = differences(before["run"], about["run"]) + differences(before["demos"] or {}, about["demos"] or {}, "demos.")
+        before = json.loads((folder / "run.json").read_text())
+        changed = differences(before["run"], identity["run"])
+        changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder."
         ) from error
     if changed:
         raise InputError(f"The folder {folder} holds another run: {'; '.join(changed)}; use its settings or another --out.")
-    updated = differences(before.get("versions", {}), about["versions"])
-    if updated and not (folder / "DONE").exists():
-        reporter.say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
+    return before
 
 
 def commit() -> str | None:

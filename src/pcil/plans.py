@@ -1,0 +1,155 @@
+"""What a sweep's file asks for: each run, checked as `pcil train` checks it, and how it stands, read from its folder alone."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pcil import arguments, envs, runs
+from pcil.config import Run
+from pcil.errors import InputError
+from pcil.report.load import read_evaluations
+
+PRODUCT: dict[str, Any] = {
+    "tasks": ["walker_walk"],
+    "methods": ["pcil"],
+    "seeds": [1, 2],
+    "preset": "default",
+    "frames": 200_000,
+    "settings": {},
+    "variants": {"name": {}},
+}
+"""What a product of runs may say, by example: the file itself, and each of its [[runs]]."""
+FILE = PRODUCT | {"cores": 1, "gpus": 0.5, "runs": [{}]}
+
+
+@dataclass
+class Job:
+    """One run of a sweep, and how it stands."""
+
+    name: str
+    folder: Path
+    words: list[str]
+    """Those of `pcil train`."""
+    run: Run
+    log: Path
+    """What the run prints."""
+    state: str = "waiting"
+    """waiting, running, done or failed."""
+    frames: int = 0
+    rate: float = 0.0
+    """Frames a second."""
+    last_return: float = 0.0
+    """Mean of the last evaluation."""
+
+    def look(self) -> None:
+        """Read the folder; a file that is not there yet, or half written, changes nothing."""
+        if (self.folder / "DONE").exists():
+            self.state = "done"
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+            with (self.folder / "train.jsonl").open("rb") as file:
+                file.seek(max(file.seek(0, os.SEEK_END) - 10_000, 0))
+                last = json.loads(file.read().split(b"\n")[-2])
+            self.frames, self.rate = last["frames"], last["frames_per_second"]
+            table = read_evaluations(self.folder)
+            self.last_return = float(table["return"][table["frames"] == table["frames"][-1]].mean())
+
+
+class Plan(NamedTuple):
+    """What a file asks for."""
+
+    jobs: list[Job]
+    cores: int
+    gpus: float | int
+
+
+def read(file: Path, out: Path) -> Plan:
+    """The runs of a file, each checked as `pcil train` checks it, and how they stand. Nothing is written."""
+    try:
+        table = tomllib.loads(file.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} can't be read as TOML ({error}).") from error
+    _check(str(file), table, FILE)
+    plan = Plan([], table.get("cores", 1), table.get("gpus", 0))
+    if plan.cores < 1 or plan.gpus < 0:
+        raise InputError(f"{file} gives a run {plan.cores} cores and {plan.gpus} GPUs; it needs at least 1 core and 0 GPUs.")
+    for where, product in _products(str(file), table):
+        for name, words in _combinations(where, product):
+            if any(job.name == name for job in plan.jobs):
+                raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
+            folder, found = out.absolute() / name, []
+            words.append(f"--out={folder}")
+            try:
+                arguments.train(words, lambda run, out, found=found: found.append(run) or 0)
+                runs.check(found[0], folder)
+            except InputError as error:
+                raise InputError(f"{where}, {name}: {error}") from error
+            plan.jobs.append(Job(name, folder, words, found[0], folder.with_name(f"{folder.name}.log")))
+            plan.jobs[-1].look()
+    if not plan.jobs:
+        raise InputError(f"{file} has no runs; give it tasks, methods and seeds, or [[runs]] with them.")
+    return plan
+
+
+def _products(file: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The file's own product, where it has tasks, and its [[runs]]: these have from the file what they don't give."""
+    if "tasks" in table:
+        yield file, table
+    shared = {key: table[key] for key in PRODUCT if key in table and key != "variants"}
+    for number, product in enumerate(table.get("runs", []), start=1):
+        where = f"{file}, [[runs]] {number}"
+        _check(where, product, PRODUCT)
+        yield where, {**shared, **product, "settings": _flat(shared.get("settings", {})) | _flat(product.get("settings", {}))}
+
+
+def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    """Folder and words of each run: variants x methods x tasks x seeds. A variant with a method of its own takes no other."""
+
+    def axis(key: str) -> list[Any]:
+        if not product.get(key):
+            raise InputError(f"{where} gives no {key}.")
+        return product[key]
+
+    base = {key: product[key] for key in ("preset", "frames") if key in product} | _flat(product.get("settings", {}))
+    for variant, changes in (product.get("variants") or {"": {}}).items():
+        settings = base | _flat(changes)
+        for key in {"task", "seed", "out", "help"} & settings.keys():
+            raise InputError(f"{where} has {key!r} among its settings; there are the lists tasks and seeds, and --out.")
+        own = settings.get("reward", settings.get("method"))
+        for method, task, seed in itertools.product([own] if own else axis("methods"), axis("tasks"), axis("seeds")):
+            arm = variant if own and variant else f"{method}-{variant}" if variant else method
+            name = "/".join(re.sub(r"[^\w-]+", "-", part) for part in (envs.task_name(task), arm, str(seed)))
+            options = settings if own else {"method": method} | settings
+            yield name, [task, f"--seed={seed}", *(f"--{key}={value}" for key, value in options.items())]
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as dotted names: in TOML a dotted name without quotes is a nested table."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+def _check(where: str, table: dict[str, Any], examples: dict[str, Any]) -> None:
+    for key, value in table.items():
+        if key not in examples:
+            raise InputError(f"{where} has {key!r}, which means nothing here; it may have {', '.join(examples)}.")
+        if not _alike(value, examples[key]):
+            raise InputError(f"{where} has {key} = {value!r}; it must look like {examples[key]!r}.")
+
+
+def _alike(value: Any, example: Any) -> bool:
+    """Whether two values of TOML have one type, and so have their parts; a whole number does for any number."""
+    if type(value) is not type(example):
+        return (type(value), type(example)) == (int, float)
+    value, example = ([*v.values()] if isinstance(v, dict) else v for v in (value, example))
+    return not isinstance(example, list) or not example or all(_alike(part, example[0]) for part in value)

@@ -1,0 +1,463 @@
+"""Sweeps: a file gives the runs that it says; stopped or killed, they end as if left alone; a bad one harms no other."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import io
+import itertools
+import os
+import re
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from pcil import checkpoint, cli, loop, plans, runs, sweep
+from pcil.envs import TASKS
+from pcil.errors import InputError
+from pcil.rewards import REWARDS
+from small import POINT_MASS, save_point_mass_demos, small_run
+from test_loop import StopAfter, finish, same_run
+
+ROOT = Path(__file__).parent.parent
+ARMS = "toy-point_mass-v0"
+NARROW = """
+seed_frames = 100
+random_frames = 100
+evaluate_episodes = 2
+evaluate_every = 100
+agent.hidden = 16
+agent.feature_dim = 8
+agent.noise.steps = 1000
+"agent.batch_size" = 32
+reward.hidden = 16
+reward.batch_size = 32
+"""
+"""`small.small_run` as settings, so that both share one compilation; dotted names with quotes and without."""
+PRODUCT = f"tasks = ['{POINT_MASS}']\nmethods = ['pcil']\nseeds = [1, 2]\nframes = 300\n"
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
+
+
+def plan(text: str, out: str = "out") -> plans.Plan:
+    """What a file with this text asks for."""
+    Path("sweep.toml").write_text(text)
+    return plans.read(Path("sweep.toml"), Path(out))
+
+
+ANY_LABEL = sorted(name for name, kind in REWARDS.items() if kind.scope == "step")
+"""Methods that take either label."""
+
+# --- The file ---
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    tasks=st.lists(st.sampled_from(TASKS), min_size=1, max_size=2, unique=True),
+    methods=st.lists(st.sampled_from(ANY_LABEL), min_size=1, max_size=2, unique=True),
+    seeds=st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=2, unique=True),
+    labels=st.lists(st.sampled_from(["stored", "sampled"]), max_size=2, unique=True),
+)
+def test_the_file_gives_every_combination_once(
+    tasks: list[str], methods: list[str], seeds: list[int], labels: list[str]
+) -> None:
+    """Against four plain loops; what a run is follows from where its folder is."""
+    text = f"tasks = {tasks}\nmethods = {methods}\nseeds = {seeds}\n"
+    text += "".join(f"[variants.{label}_]\nlabel = '{label}'\n" for label in labels)
+    with mock.patch.object(runs, "check"):
+        jobs = plan(text).jobs
+    expected = set()
+    for label, method, task, seed in itertools.product(labels or [None], methods, tasks, seeds):
+        expected.add((f"{task}/{method}{'' if label is None else f'-{label}_'}/{seed}", task, method, seed, label or "sampled"))
+    assert {(job.name, job.run.task, job.run.method, job.run.seed, job.run.label) for job in jobs} == expected
+    assert len(jobs) == len(expected)
+    assert all(job.folder == Path.cwd() / "out" / job.name for job in jobs)
+
+
+def test_every_setting_reaches_its_run(demos: str) -> None:
+    jobs = plan(f"{PRODUCT}[settings]\ndemos = '{demos}'\n{NARROW}").jobs
+    assert [job.run for job in jobs] == [small_run(demos=demos, seed=seed) for seed in (1, 2)]
+    assert [job.name for job in jobs] == [f"{ARMS}/pcil/1", f"{ARMS}/pcil/2"]
+
+
+def test_variants_multiply_and_one_with_a_method_of_its_own_stands_alone() -> None:
+    text = "tasks = ['pendulum_swingup']\nmethods = ['pcil', 'dac']\nseeds = [1]\n[settings]\nagent.gamma = 0.9\n"
+    text += "[variants.stored]\nlabel = 'stored'\nagent.gamma = 0.8\n[variants.oracle]\nmethod = 'expert'\npreset = 'paper'\n"
+    found = {job.name.split("/")[1]: job.run for job in plan(text).jobs}
+    assert list(found) == ["pcil-stored", "dac-stored", "oracle"]
+    assert [run.method for run in found.values()] == ["pcil", "dac", "expert"]
+    assert [run.agent.gamma for run in found.values()] == [0.8, 0.8, 0.9]
+    assert [(run.label, run.preset) for run in found.values()] == [("stored", "default")] * 2 + [("stored", "paper")]
+
+
+def test_further_runs_have_from_the_file_what_they_do_not_give() -> None:
+    text = "tasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1]\nframes = 5000\n[settings]\nagent.gamma = 0.9\n"
+    text += "agent.tau = 0.5\n[[runs]]\ntasks = ['finger_spin']\nseeds = [7]\nsettings = {agent.gamma = 0.8}\n"
+    _, job = plan(text).jobs
+    assert (job.name, job.run.frames, job.run.agent.gamma, job.run.agent.tau) == ("finger_spin/expert/7", 5000, 0.8, 0.5)
+
+
+def test_the_examples_of_the_docs_are_sweeps() -> None:
+    first, second = re.findall(r"^```toml\n(.*?)^```$", (ROOT / "docs" / "sweeps.md").read_text(), re.MULTILINE | re.DOTALL)
+    names = [job.name for job in plan(first).jobs]
+    assert len(names) == 2 * 2 * 2 * 3 + 1 and names[-1] == "pendulum_swingup/expert/1"
+    assert [job.name.split("/")[1] for job in plan(second).jobs] == ["pcil-plain"] * 3 + ["oracle"] * 3
+
+
+def test_a_file_may_hold_nothing_but_further_runs() -> None:
+    (job,) = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [3]").jobs
+    assert job.name == "pendulum_swingup/expert/3"
+
+
+WHOLE = "tasks = ['pendulum_swingup']\nmethods = ['pcil']\nseeds = [1]\n"
+BAD = [
+    # the file, what the sentence must hold
+    ("tasks = [", "can't be read as TOML"),
+    ("", "has no runs"),
+    ("frames = 5000", "has no runs"),
+    (WHOLE + "sedes = [2]", "'sedes', which means nothing here; it may have tasks, methods, seeds"),
+    (WHOLE.replace("[1]", "1"), r"seeds = 1; it must look like \[1, 2\]"),
+    (WHOLE.replace("[1]", "[true]"), r"seeds = \[True\]"),
+    (WHOLE.replace("['pcil']", "'pcil'"), "methods = 'pcil'"),
+    (WHOLE.replace("[1]", "[]"), "gives no seeds"),
+    (WHOLE.replace("methods", "frames = 5000 #"), "gives no methods"),
+    (WHOLE.replace("[1]", "[1, 1]"), "the run pendulum_swingup/pcil/1 a second time"),
+    (WHOLE + "[[runs]]\nframes = 5000", r"\[\[runs\]\] 1 has the run pendulum_swingup/pcil/1 a second time"),
+    (WHOLE + "[[runs]]\ncores = 2", r"\[\[runs\]\] 1 has 'cores'"),
+    (
+        WHOLE.replace("pendulum_swingup", "pendulum_swingpu"),
+        "no environment 'pendulum_swingpu'.*did you mean 'pendulum_swingup'",
+    ),
+    (WHOLE.replace("pcil", "gial"), "no method 'gial'; the methods are"),
+    (WHOLE + "preset = 'best'", "no preset 'best'"),
+    (WHOLE + "preset = ['paper']", r"preset = \['paper'\]"),
+    (WHOLE + "frames = 'many'", "frames = 'many'; it must look like 200000"),
+    (WHOLE + "frames = 100", "100 frames"),
+    (WHOLE.replace("[1]", "[-1]"), "seed is -1"),
+    (WHOLE + "cores = 0", "0 cores"),
+    (WHOLE + "gpus = -1", "-1 GPUs"),
+    (WHOLE + "[settings]\nagent.gama = 0.9", "--agent.gama"),
+    (WHOLE + "[settings]\nagent.batch_size = 64.5", "--agent.batch-size INT"),
+    (WHOLE + "[settings]\nseed = 3", "'seed' among its settings"),
+    (WHOLE + "[settings]\nhelp = true", "'help' among its settings"),
+    (WHOLE + "[settings]\ndemos = 'nowhere'", "'nowhere'"),
+    (WHOLE + "[variants.odd]\nlabel = 'often'", "'often'"),
+    (WHOLE + "[variants]\nodd = 1", "variants = {'odd': 1}"),
+]
+
+
+@pytest.mark.parametrize(("text", "said"), BAD, ids=[said for _, said in BAD])
+def test_a_bad_file_is_one_sentence_and_nothing_starts(text: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("sweep.toml").write_text(text)
+    assert cli.main(["sweep", "sweep.toml", "--out", "out"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("pcil: sweep.toml") and err.count("\n") == 1 and not re.search(r"[.!?] [A-Z]", err)
+    assert re.search(said, err), err
+    assert [path.name for path in Path.cwd().iterdir()] == ["sweep.toml"]
+
+
+def test_a_file_that_is_not_there_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["sweep", "nowhere.toml", "--out", "out"]) == 2
+    assert "nowhere.toml can't be read" in capsys.readouterr().err
+
+
+def test_a_folder_with_other_settings_is_refused_even_if_it_is_done(demos: str) -> None:
+    (job, _) = plan(text := f"{PRODUCT}[settings]\ndemos = '{demos}'\n{NARROW}").jobs
+    finish(job.run, job.folder)
+    with pytest.raises(InputError, match=r"pcil/1: .*another run: frames was 300, now 400"):
+        plan(text.replace("frames = 300", "frames = 400"))
+
+
+# --- What is read from the folders, and shown ---
+
+
+def test_the_folder_says_how_a_run_stands(demos: str) -> None:
+    text = f"{PRODUCT}[settings]\ndemos = '{demos}'\n{NARROW}"
+    stopped, _ = plan(text).jobs
+    with contextlib.suppress(loop.Stopped):
+        runs.execute(stopped.run, stopped.folder, StopAfter(4))
+    with (stopped.folder / "train.jsonl").open("a") as file:
+        file.write('{"frames": 99')  # a line that is being written
+    stopped, untouched = plan(text).jobs
+    assert (untouched.state, untouched.frames) == ("waiting", 0)
+    assert (stopped.state, stopped.frames) == ("waiting", 200) and stopped.rate > 0
+    last = [float(line.split(",")[2]) for line in (stopped.folder / "eval.csv").read_text().splitlines()[-2:]]
+    assert stopped.last_return == np.mean(last)
+    finish(stopped.run, stopped.folder)
+    stopped.look()
+    assert (stopped.state, stopped.frames) == ("done", 300)
+
+
+def test_a_finished_sweep_needs_no_ray(demos: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for job in plan(f"{PRODUCT}[settings]\ndemos = '{demos}'\n{NARROW}").jobs:
+        finish(job.run, job.folder)
+    monkeypatch.setitem(sys.modules, "ray", None)  # importing it raises ImportError
+    assert cli.main(["sweep", "sweep.toml", "--out", "out"]) == 0
+    assert capsys.readouterr().out == "0 of 2 runs are left to do.\n2 of 2 runs are done.\n"
+    shutil.rmtree("out")
+    assert cli.main(["sweep", "sweep.toml", "--out", "out"]) == 2
+    assert "pip install 'pcil[sweep]'" in capsys.readouterr().err
+
+
+def test_the_table_says_where_every_run_is() -> None:
+    jobs = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1, 2]\nframes = 4000").jobs
+    jobs[0].state, jobs[0].frames, jobs[0].rate, jobs[0].last_return = "running", 1000, 50.0, 12.25
+    jobs[1].state, jobs[1].frames, jobs[1].last_return = "done", 4000, 800.0
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(sweep.picture(jobs, speed=10.0, room=9))
+    title, first, second, total = (" ".join(line.split()) for line in screen.file.getvalue().splitlines())
+    assert title == "run task method seed frames return frames/s time left"
+    assert first == "expert pendulum_swingup expert 1 running 1,000/4,000 12.2 50 0:01:00"
+    assert second == "expert pendulum_swingup expert 2 done 4,000/4,000 800.0"
+    assert re.fullmatch(r"1/2 runs ━+.* 62% 0:05:00 left", total)
+
+
+def test_where_room_is_short_the_running_runs_are_shown() -> None:
+    jobs = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1, 2, 3, 4, 5]").jobs
+    jobs[3].state = "running"
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(sweep.picture(jobs, speed=0.0, room=2))
+    assert [line.split()[3:5] for line in screen.file.getvalue().splitlines()[1:3]] == [["4", "running"], ["1", "waiting"]]
+
+
+# --- On Ray ---
+
+
+def test_a_worker_waits_for_the_one_that_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    released = []
+    holder = (tmp_path / ".lock").open("w")
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    threading.Timer(0.3, lambda: (released.append(True), holder.close())).start()
+    sweep._wait_until_free(tmp_path / ".lock")
+    assert released
+    with (tmp_path / ".lock").open("w") as forever:
+        fcntl.flock(forever, fcntl.LOCK_EX)
+        monkeypatch.setattr(sweep, "PATIENCE_SECONDS", 0.01)
+        sweep._wait_until_free(tmp_path / ".lock")  # and comes back
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "head:many"])
+def test_an_address_where_nothing_is_is_said_at_once(address: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("sweep.toml").write_text(WHOLE)
+    assert cli.main(["sweep", "sweep.toml", "--out", "out", "--address", address]) == 2
+    assert f"Nothing answers at {address}" in capsys.readouterr().err
+    assert not Path("out").exists()
+
+
+class Session:
+    """Processes in a session of their own: seen as a whole, and gone at the end."""
+
+    def __init__(self, folder: Path) -> None:
+        """Bytecode is kept, for Ray starts a dozen interpreters, and has 15 seconds for some of them."""
+        self.environment = dict(os.environ, PYTHONPYCACHEPREFIX=str(folder / "bytecode"))
+        self.environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        self.leaders: list[subprocess.Popen[str]] = []
+
+    def start(self, *words: str) -> subprocess.Popen[str]:
+        """Python with these words."""
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        command = [sys.executable, *words]
+        self.leaders.append(subprocess.Popen(command, **pipes, text=True, env=self.environment, start_new_session=True))
+        return self.leaders[-1]
+
+    def members(self) -> list[int]:
+        """All processes that live, and whose session is one of ours."""
+        found = []
+        for stat in Path("/proc").glob("[0-9]*/stat"):
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                state, _, _, session = stat.read_text().rpartition(")")[2].split()[:4]
+                if state != "Z" and int(session) in [leader.pid for leader in self.leaders]:
+                    found.append(int(stat.parent.name))
+        return found
+
+    def ends(self) -> bool:
+        """Whether all of them end by themselves soon."""
+        end = time.monotonic() + 30
+        while self.members() and time.monotonic() < end:
+            time.sleep(0.1)
+        return not self.members()
+
+    def listening(self) -> set[str]:
+        """Addresses where they listen, as the kernel writes them."""
+        links = [link for pid in self.members() for link in Path(f"/proc/{pid}/fd").glob("*")]
+        sockets = set()
+        for link in links:
+            with contextlib.suppress(OSError):
+                sockets.add(os.readlink(link).removeprefix("socket:[").removesuffix("]"))
+        lines = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]]
+        return {line[1].partition(":")[0] for line in lines if line[3] == "0A" and line[9] in sockets}
+
+
+@pytest.fixture(scope="module")
+def bytecode(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bytecode")
+
+
+@pytest.fixture
+def session(bytecode: Path) -> Iterator[Session]:
+    session = Session(bytecode)
+    yield session
+    for pid in session.members():
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    for leader in session.leaders:
+        leader.communicate()
+
+
+def until(true: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 400) -> None:
+    """Wait while the process is going, and fail with what it printed where it ends before."""
+    end = time.monotonic() + seconds
+    while not true():
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            pytest.fail(f"ended with {process.returncode}: {process.communicate()[0]}")
+        time.sleep(0.1)
+
+
+def episodes(job: plans.Job) -> int:
+    log = job.folder / "train.jsonl"
+    return log.read_bytes().count(b"\n") if log.exists() else 0
+
+
+def contents(job: plans.Job) -> dict[Path, tuple[int, bytes]]:
+    """Every file of its folder, with the time of its last change."""
+    files = [path for path in job.folder.rglob("*") if path.is_file()]
+    return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def saved(job: plans.Job) -> int:
+    """Frames of the newest checkpoint."""
+    return checkpoint.restore(job.folder / "checkpoint")[1]["counters"]["frames"]
+
+
+SPY = """
+import os
+from dataclasses import dataclass
+from pcil import Reward
+
+@dataclass(frozen=True)
+class Spy(Reward):
+    hidden: int = 0
+    batch_size: int = 0
+    def init(self, demos, embed, *, key):
+        raise RuntimeError(*(os.environ.get(name) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS")))
+    def update(self, state, expert, agent, embed, *, key):
+        return state, {}
+    def reward(self, state, obs, action, embed, *, key):
+        return action[:, 0]
+"""
+
+
+def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos: str, session: Session, tmp_path: Path) -> None:
+    """Four runs: two that Ctrl-C stops, one that is done, one that fails; all on this machine's loopback device alone."""
+    Path("spy_reward.py").write_text(SPY)
+    text = f"{PRODUCT.replace('300', '5000')}[settings]\ndemos = '{demos}'\n{NARROW.replace('every = 100', 'every = 1000')}"
+    text += "[[runs]]\nseeds = [3]\nframes = 300\n[[runs]]\nseeds = [1]\nvariants.spy.reward = 'spy_reward:Spy'\n"
+    one, two, done, bad = plan(text).jobs
+    finish(done.run, done.folder)
+    before = contents(done)
+    words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]
+
+    process = session.start(*words)
+    until(lambda: min(episodes(one), episodes(two)) >= 3, process)
+    assert session.listening() and all(re.fullmatch("(0{16}FFFF0000)?0100007F|0{24}01000000", a) for a in session.listening())
+    process.send_signal(signal.SIGINT)
+    printed, _ = process.communicate(timeout=400)
+    assert process.returncode == 130 and "the same command goes on from here" in printed
+    assert session.ends()
+    for job in (one, two):
+        job.look()
+        assert job.state == "waiting" and saved(job) == job.frames < 5000
+    assert not bad.log.exists()
+
+    process = session.start(*words)
+    printed, _ = process.communicate(timeout=400)
+    assert process.returncode == 1
+    assert re.search(
+        rf"^failed  {bad.name}; .*\n(    .*\n)*    RuntimeError: \('1', '1', '.*--xla_cpu_multi_thread", printed, re.M
+    )
+    assert printed.startswith("3 of 4 runs are left to do.\n") and printed.endswith("3 of 4 runs are done.\n")
+    assert sorted(re.findall(r"^done    (\S+): return", printed, re.M)) == [one.name, two.name]
+    assert contents(done) == before
+    assert all("Resuming at" in job.log.read_text() for job in (one, two))
+    finish(one.run, tmp_path / "whole")
+    same_run(tmp_path / "whole", one.folder)
+    assert session.ends()
+
+
+NODES = """
+import sys
+from ray.cluster_utils import Cluster
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+second = cluster.add_node(num_cpus=1)
+print("at", cluster.address, second.all_processes["raylet"][0].process.pid, flush=True)
+sys.stdin.readline()
+cluster.remove_node(second, allow_graceful=False)
+print("removed", flush=True)
+sys.stdin.readline()
+cluster.shutdown()
+"""
+
+
+def worker(job: plans.Job) -> int:
+    """The process that trains it."""
+    return int(re.findall(r"^\S+, process (\d+): pcil train", job.log.read_text(), re.M)[-1])
+
+
+@pytest.mark.slow
+def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, tmp_path: Path) -> None:
+    """Two nodes with a core each. One run's worker is killed, then the other run's whole node: all end as if left alone."""
+    text = f"{PRODUCT.replace('[1, 2]', '[1, 2, 3]').replace('300', '6000')}[settings]\ndemos = '{demos}'\n"
+    jobs = plan(f"{text}checkpoint_seconds = 0\n{NARROW.replace('every = 100', 'every = 2000')}").jobs
+    session.environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    session.environment |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+    nodes = session.start("-c", NODES)
+    lines = iter(nodes.stdout.readline, "")
+    address, raylet = next(line.split()[1:] for line in lines if line.startswith("at "))
+    process = session.start("-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--address", address)
+    until(lambda: min(episodes(jobs[0]), episodes(jobs[1])) >= 3, process)
+
+    parents = {job.name: Path(f"/proc/{worker(job)}/stat").read_text().rpartition(")")[2].split()[1] for job in jobs[:2]}
+    (there,) = (job for job in jobs[:2] if parents[job.name] == raylet)
+    (here,) = (job for job in jobs[:2] if parents[job.name] != raylet)
+    killed = worker(here)
+    os.kill(killed, signal.SIGKILL)
+    until(lambda: worker(here) != killed and "Resuming at" in here.log.read_text(), process)
+    lost = worker(there)
+    nodes.stdin.write("\n")
+    nodes.stdin.flush()
+    assert next(line for line in lines if line == "removed\n")
+    printed, _ = process.communicate(timeout=800)
+    assert process.returncode == 0, printed
+    assert worker(there) != lost and "Resuming at" in there.log.read_text()
+    for job in jobs:
+        finish(job.run, tmp_path / str(job.run.seed))
+        same_run(tmp_path / str(job.run.seed), job.folder)
+    nodes.communicate("\n", timeout=200)
+    assert session.ends()
+
+
+@pytest.mark.slow
+def test_the_smoke_sweep_runs_from_end_to_end(session: Session) -> None:
+    process = session.start("-m", "pcil", "sweep", str(ROOT / "experiments" / "smoke.toml"), "--out", "smoke")
+    printed, _ = process.communicate(timeout=3000)
+    assert process.returncode == 0, printed
+    jobs = plans.read(ROOT / "experiments" / "smoke.toml", Path("smoke")).jobs
+    assert [job.name for job in jobs] == [f"pendulum_swingup/{method}/{seed}" for method in ("pcil", "dac") for seed in (1, 2)]
+    assert all(job.state == "done" and job.frames == 16_000 and f"done    {job.name}: return" in printed for job in jobs)

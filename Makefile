@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
 
-.PHONY: setup train test test-slow check bench format clean
+.PHONY: setup train test test-slow check bench docs format clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,10 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/pcil bench
+
+docs: $(STAMP)
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs --extra report --extra sweep --inexact --quiet
+	$(BIN)/mkdocs build
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -55,7 +56,7 @@ def ship(task: str, folder: Path, tries: int) -> None:
     target = demos.SHIPPED / "dmc" / task / "expert-v0"
     shutil.rmtree(target, ignore_errors=True)
     recorded.save(target)
-    policy.save(POLICIES / task)
+    dataclasses.replace(policy, info=policy.info | info).save(POLICIES / task)
     write_points(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
 

@@ -58,4 +58,7 @@ def test_the_table_says_where_it_comes_from(task: str) -> None:
     row = next(row for row in demos.shipped() if row["task"] == task)
     info = demos.Demonstrations.load(task).info
     assert row["frames"] >= 100_000 and row["seeds_tried"] >= 1 and len(row["hash"]) == 64
+    about = load_policy(POLICIES / task).info
+    for name in ("command", "seed", "frames", "commit", "run"):
+        assert about[name] == info[name]
     assert len(info["commit"].rstrip("+")) == 40 and info["command"] and info["run"]["method"] == "expert"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,13 +44,14 @@ class Policy:
         return self.actor(obs, np)
 
     def save(self, folder: Path) -> None:
-        """Write `policy.safetensors` and `policy.json` into `folder`, each by a rename, so neither is ever half written."""
+        """Write `policy.safetensors`, which holds its own checksum, and `policy.json` into `folder`, each by a rename, so
+        neither is ever half written."""
         from safetensors.numpy import save_file
 
         folder.mkdir(parents=True, exist_ok=True)
         arrays = {name: np.ascontiguousarray(array) for name, array in _named(self.actor).items()}
         text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
-        save_file(arrays, folder / "policy.safetensors.tmp")
+        save_file(arrays, folder / "policy.safetensors.tmp", {"sha256": _digest(arrays)})
         (folder / "policy.json.tmp").write_text(text + "\n")
         for name in ("policy.safetensors", "policy.json"):
             (folder / f"{name}.tmp").replace(folder / name)
@@ -61,7 +63,6 @@ def load_policy(path: str | Path) -> Policy:
     Raises `InputError` where there is none or where the files are damaged.
     """
     from safetensors import SafetensorError
-    from safetensors.numpy import load_file
 
     folder = Path(path)
     folder = folder / "policy" if (folder / "policy").is_dir() else folder
@@ -71,7 +72,7 @@ def load_policy(path: str | Path) -> Policy:
         )
     try:
         header = json.loads((folder / "policy.json").read_text())
-        arrays = load_file(folder / "policy.safetensors")
+        arrays = _read(folder / "policy.safetensors")
         actor = _build(header, arrays)
     except (ValueError, LookupError, TypeError, AttributeError, SafetensorError, OSError) as error:
         raise InputError(
@@ -84,6 +85,26 @@ def _named(actor: Actor) -> dict[str, np.ndarray]:
     """Arrays by their path in the tree, such as `head.weights.0`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(actor, eqx.is_array))
     return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of names, shapes and values."""
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.shape} ".encode() + array.astype("<f4").tobytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file; `ValueError` where they do not have the checksum that it holds, if it holds one."""
+    from safetensors import safe_open
+
+    with safe_open(path, "np") as file:
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
+        told = (file.metadata() or {}).get("sha256")
+    if told not in (None, _digest(arrays)):
+        raise ValueError("its values do not have their checksum")
+    return arrays
 
 
 def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:

@@ -16,7 +16,7 @@ def main(task: str = "walker_walk") -> None:
     spec = envs.spec(envs.make(task))
     print(f"{task:<22}{'update, ms':>12}{'products, ms':>14}{'ratio':>8}")
     for preset in ("default", "paper", "released"):
-        for method in presets.REWARDS:
+        for method in presets.METHODS:
             setup = bench.Setup(presets.make(task, method, preset), spec)
             took = bench.medians({"update_ms": setup.update, "floor_ms": setup.floor}, seconds=3)
             ratio = took["update_ms"] / took["floor_ms"]

@@ -1,18 +1,24 @@
-"""Gather the evaluations of finished runs into one small CSV: python experiments/collect.py FILE.csv RUN[=VARIANT] ..."""
+"""Gather the evaluations of finished runs, at any depth, into a small CSV: python experiments/collect.py FILE.csv FOLDER ..."""
 
+import json
 import sys
 from pathlib import Path
 
-from pcil.report.load import read_run, write_points
+from pcil import presets
+from pcil.report.load import NO_VARIANT, flat, place, read_run, write_points
 
 
-def main(target: str, *runs: str) -> None:
-    """Each `RUN` is a run folder; `VARIANT` names what was changed from its preset."""
+def main(target: str, *folders: str) -> None:
+    """A run's variant is its preset, and whatever it has changed from it."""
     points = []
-    for run in runs:
-        folder, _, variant = run.partition("=")
-        points += read_run(Path(folder), variant or None)
-    write_points(Path(target), points)
+    for folder in sorted({done.parent for top in folders for done in Path(top).rglob("DONE")}):
+        run = json.loads((folder / "run.json").read_text())["run"]
+        plain = json.loads(json.dumps(presets.make(run["task"], run["method"], run["preset"]).to_json()))
+        now, before = flat(run), flat(plain)
+        differing = (name for name in now if now[name] != before.get(name) and name not in (*NO_VARIANT, "frames"))
+        told = [f"{name}={now[name]}" for name in differing]
+        points += read_run(folder, ", ".join([run["preset"], *told]))
+    write_points(Path(target), sorted(points, key=place))
 
 
 main(*sys.argv[1:])

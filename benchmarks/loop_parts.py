@@ -18,7 +18,7 @@ bench.use_one_thread()
 
 import jax
 
-from pcil import envs, learner, loop, presets, replay, runs
+from pcil import envs, learner, loop, networks, presets, replay, runs
 
 EPISODES = range(4, 14)
 """Those that are measured; compiling is over by then."""
@@ -61,7 +61,7 @@ def main(task: str = "walker_walk") -> None:
     for owner, name in (
         (learner, "update"),
         (type(env.unwrapped), "step"),
-        (type(run.agent), "explore"),
+        (networks.Actor, "__call__"),
         (replay.Replay, "sample"),
         (loop, "on_host"),
         (learner, "label_episode"),

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcil.networks import LAYER_NORM_EPSILON, MLP, SCALER_FLOOR, SCALER_RATE, Actor, Critic, Scaler, Trunk, unit_sphere
-from pcil.noise import ACTION_MARGIN, LinearSchedule, perturb
+from pcil.noise import ACTION_MARGIN, LinearSchedule, normal_steps, perturb
 from pcil.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=50)
@@ -200,6 +200,23 @@ def test_the_schedule_is_the_same_in_numpy_as_in_a_compiled_step(schedule: Linea
         host = schedule(step, np)
         assert host.dtype == np.float32
         np.testing.assert_allclose(host, compiled(np.int32(step)), rtol=1e-6)
+
+
+def test_the_steps_of_the_noise_are_standard_normal_and_correlated_as_asked() -> None:
+    walk = normal_steps(np.random.default_rng(0), 3, 0.7)
+    steps = np.stack([next(walk) for _ in range(40_000)])
+    assert steps.dtype == np.float32
+    assert np.allclose(steps.mean(axis=0), 0, atol=0.05) and np.allclose(steps.std(axis=0), 1, atol=0.03)
+    for lag in (1, 2, 5):
+        correlation = (steps[lag:] * steps[:-lag]).mean(axis=0)
+        np.testing.assert_allclose(correlation, 0.7**lag, atol=0.03)
+    assert np.abs(np.corrcoef(steps.T) - np.eye(3)).max() < 0.05
+
+
+def test_without_correlation_the_noise_is_the_generators_own() -> None:
+    walk, rng = normal_steps(np.random.default_rng(1), 2, 0.0), np.random.default_rng(1)
+    for _ in range(5):
+        np.testing.assert_array_equal(next(walk), rng.standard_normal(2, dtype=np.float32))
 
 
 def test_the_schedule_never_turns_back() -> None:

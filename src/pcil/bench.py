@@ -105,6 +105,7 @@ class Setup:
         demo = Batch(normal(500, spec.obs_dim), normal(500, spec.action_dim))
         self.state = learner.init(run.learner, spec, (demo,) * 10, 0)
         self.actor = on_host(run.agent.actor(self.state.agent))
+        self.explore = run.agent.explorer(spec.action_dim, rng)
         self.obs = normal(spec.obs_dim)
         step = functools.partial(learner.update, run.learner)
         jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, None, np.int32(0), np.int32(0))
@@ -133,7 +134,7 @@ class Setup:
     def act(self, times: int) -> None:
         """Actions for one observation."""
         for _ in range(times):
-            self.run.agent.explore(self.actor, self.obs, step=0, rng=self.rng)
+            self.explore(self.actor, self.obs, 0)
 
     def sample(self, times: int) -> None:
         """Batches of windows."""

@@ -123,6 +123,7 @@ def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
     sample_rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
     seed = seeds.episode_seed(run.seed, Stream.EPISODE, counters.episodes)
     observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
+    explore = run.agent.explorer(spec.action_dim, act_rng)
     host: Actor | None = None
     over = terminated = False
     while not over:
@@ -130,7 +131,7 @@ def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
             action = act_rng.uniform(-1, 1, spec.action_dim).astype(np.float32)
         else:
             host = host or on_host(state.actor)
-            action = run.agent.explore(host, observations[-1], step=counters.steps, rng=act_rng)
+            action = explore(host, observations[-1], counters.steps)
         if _update_due(run, state.replay, counters):
             counters, host = _update(run, state, state.replay, counters, sample_rng), None
         obs, reward, terminated, truncated, _ = env.step(action)

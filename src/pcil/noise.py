@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf
 from types import ModuleType
@@ -9,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from pcil.errors import check_ranges
@@ -31,6 +33,18 @@ class LinearSchedule:
     def __call__(self, step: Any, xp: ModuleType = jnp) -> Float[Any, ""]:
         mix = xp.minimum(xp.maximum(xp.float32(step) / xp.float32(max(self.steps, 1)), 0.0), 1.0)
         return xp.float32(self.start) * (1 - mix) + xp.float32(self.end) * mix
+
+
+def normal_steps(rng: np.random.Generator, dim: int, correlation: float) -> Iterator[Float[np.ndarray, " dim"]]:
+    """Standard normal vectors, each correlated with the one before: `x' = c x + sqrt(1 - c^2) z`, whose variance stays 1.
+
+    This is the Ornstein-Uhlenbeck noise of DDPG (Lillicrap et al. 2016), started from its own distribution.
+    """
+    fresh = np.float32((1 - correlation**2) ** 0.5)
+    steps = rng.standard_normal(dim, dtype=np.float32)
+    while True:
+        yield steps
+        steps = np.float32(correlation) * steps + fresh * rng.standard_normal(dim, dtype=np.float32)
 
 
 def perturb(

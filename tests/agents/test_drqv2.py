@@ -91,7 +91,8 @@ def test_update_noise_is_clipped_and_acting_noise_is_not() -> None:
     two, _ = wild.update(state, window, step=jnp.int32(0), key=jax.random.key(2))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
     host, rng = loop.on_host(state.actor), np.random.default_rng(0)
-    actions = [wild.explore(host, np.asarray(window.obs[0, 0]), step=0, rng=rng) for _ in range(200)]
+    explore = wild.explorer(SPEC.action_dim, rng)
+    actions = [explore(host, np.asarray(window.obs[0, 0]), 0) for _ in range(200)]
     assert np.std(actions) > 0.4 and np.abs(actions).max() <= 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import Any, ClassVar, Literal
@@ -15,6 +16,8 @@ from pcil.networks import Actor, Trunk
 from pcil.types import Spec, Window
 
 Metrics = dict[str, Float[Array, ""]]
+Explorer = Callable[[Actor, np.ndarray, int], np.ndarray]
+"""`(actor, obs [obs], agent steps so far) -> action [action]`."""
 
 
 @dataclass(frozen=True)
@@ -53,5 +56,5 @@ class Agent(abc.ABC):
         """The features of an observation on which imitation rewards are learned; they are not trained by them."""
 
     @abc.abstractmethod
-    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
-        """An action `[action]` with exploration noise, on the host."""
+    def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
+        """What acts in one episode, with exploration noise from `rng`, on the host."""

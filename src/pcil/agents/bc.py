@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pcil.agents.base import Agent, Metrics
+from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
 from pcil.networks import Actor, Trunk
 from pcil.optimiser import Moments, adam_init, adam_step
@@ -73,6 +73,6 @@ class BC(Agent):
         del whose
         return state.actor.trunk
 
-    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
-        del step, rng
-        return actor(obs, np)
+    def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
+        del action_dim, rng
+        return lambda actor, obs, step: actor(obs, np)

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pcil.agents.base import Agent, Metrics
+from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
 from pcil.losses import n_step_target
 from pcil.networks import Actor, Critic, Scaler, Trunk
-from pcil.noise import LinearSchedule, perturb
+from pcil.noise import LinearSchedule, normal_steps, perturb
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
@@ -54,13 +54,16 @@ class DrQV2(Agent):
     """Standard deviation of the exploration noise over agent steps."""
     noise_clip: float = 0.3
     """Bound on the noise of the actions inside the updates; acting has no bound."""
+    noise_correlation: float = 0.0
+    """Correlation of the acting noise of a step with that of the step before; 0 is white noise, as DrQ-v2's. Correlated
+    noise moves a joint for several steps in one direction."""
     standardise: bool = False
     """Give the trunks observations of running mean 0 and standard deviation 1: layer normalisation forgets an observation's
     length, and entries in large units drown the others."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf))
+        check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf), noise_correlation=(0, 1))
         check_ranges(self, feature_dim=(1, inf), hidden=(1, inf))
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> DrQV2State:
@@ -136,10 +139,9 @@ class DrQV2(Agent):
         trunk = trunk if scaler is None else scaler.fold(trunk)
         return eqx.tree_at(lambda t: t.weight, trunk, trunk.weight[:-1]) if drop_last else trunk
 
-    def explore(self, actor: Actor, obs: np.ndarray, *, step: int, rng: np.random.Generator) -> np.ndarray:
-        mean = actor(obs, np)
-        noise = self.noise(step, np) * rng.standard_normal(mean.shape, dtype=np.float32)
-        return perturb(mean, noise, np)
+    def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
+        noise = normal_steps(rng, action_dim, self.noise_correlation)
+        return lambda actor, obs, step: perturb(actor(obs, np), self.noise(step, np) * next(noise), np)
 
 
 def _scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:

@@ -12,7 +12,7 @@ import pytest
 
 from pcil import presets
 from pcil.agents import DrQV2
-from pcil.config import Run, differences
+from pcil.config import Run, completed, differences
 from pcil.envs import TASKS
 from pcil.errors import InputError
 from pcil.rewards import REWARDS, TaskReward
@@ -129,6 +129,25 @@ def test_another_reward_is_a_difference_even_where_its_settings_are_equal() -> N
 
 def test_fields_that_one_side_lacks_are_differences() -> None:
     assert differences({"a": 1}, {"b": {"c": 2}}) == ["a was 1, now None", "b was None, now {'c': 2}"]
+
+
+def test_a_setting_that_an_older_run_lacks_had_its_classes_default() -> None:
+    """So a run of an older version goes on, and only a value that changes what it did is a difference."""
+    run = presets.make("walker_walk")
+    older = to_json(run)
+    del older["agent"]["noise_correlation"], older["agent"]["standardise"], older["agent"]["noise"]["end"]
+    found = differences(completed(older, to_json(run.plain)), to_json(run))
+    assert run.agent.standardise and not DrQV2().standardise
+    assert found == ["agent.standardise was False, now True"]
+
+
+def test_what_a_reward_cannot_do_without_is_kept_where_the_rest_is_plain() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Needy(TaskReward):
+        weight: float = dataclasses.field(kw_only=True)
+
+    plain = dataclasses.replace(presets.make("walker_walk", "expert"), reward=Needy(weight=3.0, task_weight=2.0)).plain
+    assert plain.reward == Needy(weight=3.0)
 
 
 def test_how_often_to_save_is_no_difference() -> None:

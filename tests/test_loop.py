@@ -212,6 +212,20 @@ def test_a_changed_setting_is_refused_with_the_difference(
         runs.execute(dataclasses.replace(run, **change), tmp_path / "run", runs.Silent())
 
 
+def test_a_run_of_before_a_setting_was_there_goes_on(demos: str, tmp_path: Path) -> None:
+    run, folder = small_run(demos=demos), tmp_path / "run"
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, folder, StopAfter(1))
+    about = json.loads((folder / "run.json").read_text())
+    assert about["run"]["agent"].pop("noise_correlation") == 0.0
+    (folder / "run.json").write_text(json.dumps(about))
+    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, noise_correlation=0.5))
+    with pytest.raises(InputError, match=r"another run: agent.noise_correlation was 0.0, now 0.5; "):
+        runs.execute(other, folder, runs.Silent())
+    runs.execute(run, folder, runs.Silent())
+    assert (folder / "DONE").exists()
+
+
 def test_how_often_to_save_may_change(demos: str, tmp_path: Path) -> None:
     run = small_run(demos=demos)
     with pytest.raises(loop.Stopped):

@@ -88,6 +88,12 @@ class Run:
         """The part of the settings that is compiled."""
         return Method(self.agent, self.reward, self.label)
 
+    @property
+    def plain(self) -> Run:
+        """This run with agent and reward at the defaults of their classes: what an older `run.json`, written before a setting
+        was there, says of it. So a new setting's default must be what the code did without it."""
+        return dataclasses.replace(self, agent=_plain(self.agent), reward=_plain(self.reward))
+
     def to_json(self) -> dict[str, Any]:
         """Every setting, nested; agent and reward say their class."""
         tree = dataclasses.asdict(self)
@@ -115,6 +121,20 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
             own[name] = value
     own |= {name: changed(own.get(name, getattr(settings, name)), inner) for name, inner in nested.items()}
     return dataclasses.replace(settings, **own)
+
+
+def _plain(settings: Any) -> Any:
+    """Settings at their class's defaults, where it has some."""
+    fields = dataclasses.fields(settings)
+    own = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
+    own |= {field.name: field.default_factory() for field in fields if field.default_factory is not dataclasses.MISSING}
+    return dataclasses.replace(settings, **own)
+
+
+def completed(old: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """`old` with what it lacks of nested `defaults`."""
+    both = {name: completed(value, defaults[name]) for name, value in old.items() if isinstance(defaults.get(name), dict)}
+    return {**defaults, **old, **both}
 
 
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:

@@ -70,9 +70,16 @@ def transitions(source: Source, row: Point) -> list[Dot]:
 
 def restored(settings: dict[str, Any]) -> Run:
     """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
-    given = {name: value for name, value in settings.items() if not name.endswith(".class")}
-    run = presets.make(**given)
-    if flat(json.loads(json.dumps(run.to_json()))) != settings:
+
+    def made(settings: dict[str, Any]) -> Run:
+        return presets.make(**{name: value for name, value in settings.items() if not name.endswith(".class")})
+
+    def told(run: Run) -> dict[str, Any]:
+        return flat(json.loads(json.dumps(run.to_json())))
+
+    settings = told(made(settings).plain) | settings
+    run = made(settings)
+    if told(run) != settings:
         raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
     return run
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pcil import compilation, envs, loop, presets
-from pcil.config import Run, differences
+from pcil.config import Run, completed, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
 from pcil.evaluate import Evaluation
@@ -123,7 +123,7 @@ def check(run: Run, folder: Path) -> None:
     """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
     identity = _identity(run, demonstrations(run))
     if (folder / "run.json").exists():
-        _refuse_another(folder, identity)
+        _refuse_another(run, folder, identity)
 
 
 def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
@@ -140,17 +140,18 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
     if not path.exists():
         _write(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
         return
-    before = _refuse_another(folder, identity)
+    before = _refuse_another(run, folder, identity)
     updated = differences(before.get("versions", {}), versions)
     if updated and not (folder / "DONE").exists():
         reporter.say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
 
 
-def _refuse_another(folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
+def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
         before = json.loads((folder / "run.json").read_text())
-        changed = differences(before["run"], identity["run"])
+        plain = json.loads(json.dumps(run.plain.to_json()))
+        changed = differences(completed(before["run"], plain), identity["run"])
         changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(

@@ -1,6 +1,5 @@
 """What learning looked like over spans of the runs of one method and task: python experiments/spans.py RUN ...
 
-
 Each cell is the range over the runs of the mean over a span's episodes, as `train.jsonl` has them.
 """
 

@@ -121,7 +121,7 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("pwil", "default"): {"reward": PWIL(), "label": "stored"},  # as paper
     ("sil", "paper"): {"reward": SIL(learning_rate=1e-4)},  # paper Table; otherwise Papagiannis and Li 2020: no text for SIL
     ("sil", "released"): {"reward": SIL(), **SIL_AS_RELEASED},  # Papagiannis and Li 2020: the release has POTIL alone
-    ("sil", "default"): {"reward": SIL(), "label": "stored"},  # ours
+    ("sil", "default"): {"reward": SIL(every=1000), "label": "stored"},  # ours: a faster critic leaves nothing to learn
     ("potil", "paper"): {"reward": POTIL()},  # authors' agent/potil.py: no text for it
     ("potil", "released"): {"reward": POTIL(), **SIL_AS_RELEASED, "reward.batch_size": 0},  # authors' agent/potil.py
     ("potil", "default"): {"reward": POTIL(), "label": "stored"},  # as paper

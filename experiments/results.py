@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pcil.demos import shipped
 from pcil.report import figures, stats, tables
-from pcil.report.load import Collection, collect
+from pcil.report.load import Collection, Dot, Point, read_points
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
@@ -39,7 +39,7 @@ def main(words: list[str]) -> int:
     if "--check" in words:
         return int(stale > 0)
     for file in sorted((ROOT / "results").iterdir()):
-        found, path = collect(sorted(file.glob("*.csv")) or [file]), ROOT / "docs" / "figures" / file.stem
+        found, path = results(file.stem), ROOT / "docs" / "figures" / file.stem
         _ = figures.clouds(found.dots, path) if found.dots else figures.grid(found.points, path)
         print(path.relative_to(ROOT))
     return 0
@@ -47,8 +47,10 @@ def main(words: list[str]) -> int:
 
 @cache
 def results(name: str) -> Collection:
-    """The rows of `results/<name>.csv`."""
-    return collect([ROOT / "results" / f"{name}.csv"])
+    """The rows of `results/<name>.csv`, or of all files in `results/<name>/`."""
+    files = sorted((ROOT / "results" / name).glob("*.csv")) or [ROOT / "results" / f"{name}.csv"]
+    rows = [row for file in files for row in read_points(file)]
+    return Collection([row for row in rows if isinstance(row, Point)], [row for row in rows if isinstance(row, Dot)], {}, [])
 
 
 def demos_table() -> str:

@@ -28,7 +28,7 @@ def report(
         from pcil.report import load, page
     except ImportError as error:
         raise InputError(f"A report needs {error.name}, which pip install 'pcil[report]' brings.") from error
-    found = load.collect(paths)
+    found = load.collect(paths, representation.completed)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

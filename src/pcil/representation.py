@@ -68,20 +68,28 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     return project(expert, agent, reward, row._replace(frames=frames))
 
 
+def completed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
+    try:
+        return _told(_made(settings).plain) | settings
+    except (InputError, TypeError):
+        return settings
+
+
 def restored(settings: dict[str, Any]) -> Run:
     """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
-
-    def made(settings: dict[str, Any]) -> Run:
-        return presets.make(**{name: value for name, value in settings.items() if not name.endswith(".class")})
-
-    def told(run: Run) -> dict[str, Any]:
-        return flat(json.loads(json.dumps(run.to_json())))
-
-    settings = told(made(settings).plain) | settings
-    run = made(settings)
-    if told(run) != settings:
+    run = _made(settings)
+    if _told(run) != settings:
         raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
     return run
+
+
+def _made(settings: dict[str, Any]) -> Run:
+    return presets.make(**{name: value for name, value in settings.items() if not name.endswith(".class")})
+
+
+def _told(run: Run) -> dict[str, Any]:
+    return flat(json.loads(json.dumps(run.to_json())))
 
 
 def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:

@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
 from pcil import presets
 from pcil.report import figures
@@ -227,11 +228,11 @@ def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes])
     figures.clouds(dots, tmp_path / "clouds")
     panels = [axes for axes in drawn if axes.get_title()]
     assert [axes.get_title().split(",")[:2] for axes in panels] == [["a", " dac"], ["a", " pcil"], ["b", " pcil"]]
-    agent, expert = panels[0].collections
+    (agent,), (expert,) = panels[0].collections, panels[0].lines
     assert np.asarray(agent.get_offsets()).tolist() == [[11, 1], [12, 3]]
-    assert np.asarray(expert.get_offsets()).tolist() == [[10, 0]]
+    assert expert.get_xydata().tolist() == [[10, 0]] and expert.get_label() == "expert"
     assert agent.get_array().tolist() == [0, 2]
-    red, green, blue, _ = expert.get_facecolor()[0]
+    red, green, blue = to_rgb(expert.get_color())
     assert blue > green > red, "experts are blue"
     low, high = figures.REWARD_COLOURS([0.0, 1.0])
     assert low[1] > 2 * low[0] and low.sum() < high.sum() and min(high[:2]) > 0.8 > 0.3 > high[2], "dark green to yellow"

@@ -120,12 +120,25 @@ def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path
     fake_run(tmp_path / "e", [5], method="dac", n_step=1)
     by = {(point.task, point.method, point.variant, point.seed): point.return_mean for point in collect([tmp_path]).points}
     assert by == {
-        ("walker_run", "pcil", "default, agent.gamma=0.99", 1): 1,
-        ("walker_run", "pcil", "default, agent.gamma=0.99", 2): 2,
+        ("walker_run", "pcil", "default", 1): 1,
+        ("walker_run", "pcil", "default", 2): 2,
         ("walker_run", "pcil", "default, agent.gamma=0.9", 1): 3,
-        ("hopper_hop", "pcil", "default, agent.gamma=0.99", 1): 4,
+        ("hopper_hop", "pcil", "default", 1): 4,
         ("walker_run", "dac", "default", 1): 5,
     }
+
+
+def test_where_no_value_is_the_usual_one_all_are_told(tmp_path: Path) -> None:
+    fake_run(tmp_path / "a", [1], agent={"gamma": 0.99})
+    fake_run(tmp_path / "b", [2], agent={"gamma": 0.9})
+    assert {point.variant for point in collect([tmp_path]).points} == {"default, agent.gamma=0.9", "default, agent.gamma=0.99"}
+
+
+def test_settings_that_a_run_lacks_may_be_completed(tmp_path: Path) -> None:
+    for seed, agent in enumerate(({"gamma": 0.99}, {"gamma": 0.99, "novel": 0}, {"gamma": 0.99, "novel": 1})):
+        fake_run(tmp_path / str(seed), [1], seed=seed, agent=agent)
+    found = collect([tmp_path], lambda settings: {"agent.novel": 0} | settings)
+    assert [name[2:] for name in found.sources] == [("default", 0), ("default", 1), ("default, agent.novel=1", 2)]
 
 
 def test_settings_of_the_machine_make_no_variant() -> None:

@@ -208,7 +208,8 @@ def _cloud(axis: Axes, dots: Sequence[Dot]) -> None:
     shared = {"s": 12, "linewidths": 0, "rasterized": True}
     rewards = np.array([dot.reward for dot in agent], np.float64)
     seen = axis.scatter([dot.x for dot in agent], [dot.y for dot in agent], c=rewards, cmap=REWARD_COLOURS, **shared)
-    axis.scatter([dot.x for dot in expert], [dot.y for dot in expert], color=BLUE, marker="^", **shared)
+    look = {"color": BLUE, "markersize": 3.5, "markeredgewidth": 0, "linestyle": "", "rasterized": True}
+    axis.plot([dot.x for dot in expert], [dot.y for dot in expert], marker="^", label="expert", **look)
     bar = axis.figure.colorbar(seen, ax=axis, label="true reward of the agent", shrink=0.8)
     assert bar.solids is not None
     bar.solids.set_rasterized(True)

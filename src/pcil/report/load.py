@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
@@ -81,8 +82,11 @@ class Collection(NamedTuple):
     """A sentence for each thing that was left out."""
 
 
-def collect(paths: Sequence[Path]) -> Collection:
-    """Runs at any depth below folders, and the rows of CSV files; `InputError` where not one run can be read."""
+def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str, Any]] = dict) -> Collection:
+    """Runs at any depth below folders, and the rows of CSV files; `InputError` where not one run can be read.
+
+    `complete` adds to a run's settings those that are newer than the run.
+    """
     points, dots, sources, notes = found = Collection([], [], {}, [])
     folders: dict[Path, Path] = {}
     for path in paths:
@@ -96,7 +100,7 @@ def collect(paths: Sequence[Path]) -> Collection:
     for folder in folders.values():
         try:
             rows, about = read_run(folder), json.loads((folder / "run.json").read_text())
-            runs.append((rows, Source(folder, flat(about["run"]), (folder / "DONE").exists())))
+            runs.append((rows, Source(folder, complete(flat(about["run"])), (folder / "DONE").exists())))
         except InputError as error:
             notes.append(str(error))
     for (rows, source), variant in zip(runs, _variants([source.settings for _, source in runs]), strict=True):
@@ -198,11 +202,22 @@ _PARSERS = {str: str, int: int, float: float, float | None: lambda text: float(t
 
 
 def _variants(runs: Sequence[dict[str, Any]]) -> list[str]:
-    """The preset of each run, and the settings in which runs of its method and preset differ on one task."""
+    """The preset of each run, and the settings in which runs of its method and preset differ on one task, but for what most
+    of these runs have."""
     differing: dict[tuple[str, str], set[str]] = {}
     for one, other in itertools.combinations(runs, 2):
         if all(one[name] == other[name] for name in ("task", "method", "preset")):
             names = {name for name in one | other if one.get(name) != other.get(name)} - set(NO_VARIANT)
             differing.setdefault((one["method"], one["preset"]), set()).update(names)
-    told = [sorted(differing.get((run["method"], run["preset"]), ())) for run in runs]
-    return [", ".join([run["preset"], *(f"{n}={run.get(n)}" for n in names)]) for run, names in zip(runs, told, strict=True)]
+    usual: dict[tuple[str, str], list[tuple[str, Any]]] = {}
+    for kind, names in differing.items():
+        for name in names:
+            values = Counter(str(run.get(name)) for run in runs if (run["method"], run["preset"]) == kind).most_common(2)
+            if values[0][1] > values[1][1]:
+                usual.setdefault(kind, []).append((name, values[0][0]))
+    labels = []
+    for run in runs:
+        kind = run["method"], run["preset"]
+        told = [(name, str(run.get(name))) for name in sorted(differing.get(kind, ()))]
+        labels.append(", ".join([run["preset"], *(f"{n}={v}" for n, v in told if (n, v) not in usual.get(kind, ()))]))
+    return labels

@@ -29,8 +29,8 @@ def main(wanted: list[str]) -> None:
         if task not in plan:
             raise InputError(f"experts.toml has no {task}; it has {', '.join(plan)}.")
         settings = dict(plan[task])
-        tries, seed = settings.pop("tries"), settings.pop("record_seed", 0)
-        ship(task, best(task, settings), tries, seed)
+        how = {name: settings.pop(name) for name in ("wanted", "tries")}
+        ship(task, seed=settings.pop("record_seed", 0), **how, folder=best(task, settings))
 
 
 def best(task: str, settings: dict[str, Any]) -> Path:
@@ -47,12 +47,14 @@ def best(task: str, settings: dict[str, Any]) -> Path:
     return max(finished, key=lambda folder: finished[folder])
 
 
-def ship(task: str, folder: Path, tries: int, seed: int) -> None:
+def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int) -> None:
     """Ten deterministic episodes and the policy into the package, in place of what was there, and its curve into results."""
     policy = load_policy(folder)
     command = f"python experiments/experts.py {task}"
     info = runs.provenance(folder, policy, command) | {"seeds_tried": tries}
     recorded = demos.record(policy, envs.make(task), EPISODES, task=task, seed=seed, info=info)
+    if recorded.return_mean < wanted:
+        recorded.info["expert"] += f"; below the wanted {wanted}"
     target = demos.SHIPPED / "dmc" / task / "expert-v0"
     shutil.rmtree(target, ignore_errors=True)
     recorded.save(target)

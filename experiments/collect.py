@@ -13,8 +13,7 @@ def main(target: str, *folders: str) -> None:
     points = []
     for folder in sorted({done.parent for top in folders for done in Path(top).rglob("DONE")}):
         run = json.loads((folder / "run.json").read_text())["run"]
-        plain = json.loads(json.dumps(presets.make(run["task"], run["method"], run["preset"]).to_json()))
-        now, before = flat(run), flat(plain)
+        now, before = flat(run), flat(presets.make(run["task"], run["method"], run["preset"]).to_json())
         differing = (name for name in now if now[name] != before.get(name) and name not in (*NO_VARIANT, "frames"))
         told = [f"{name}={now[name]}" for name in differing]
         points += read_run(folder, ", ".join([run["preset"], *told]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass, field
 from math import inf
 from typing import Annotated, Any, Literal
@@ -95,12 +96,12 @@ class Run:
         return dataclasses.replace(self, agent=_plain(self.agent), reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:
-        """Every setting, nested; agent and reward say their class."""
+        """Every setting, nested, as JSON gives it back; agent and reward say their class."""
         tree = dataclasses.asdict(self)
         for name in ("agent", "reward"):
             kind = type(getattr(self, name))
             tree[name] = {"class": f"{kind.__module__}:{kind.__qualname__}", **tree[name]}
-        return tree
+        return json.loads(json.dumps(tree))
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:

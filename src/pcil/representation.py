@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -71,7 +70,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
 def completed(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
     try:
-        return _told(_made(settings).plain) | settings
+        return flat(_made(settings).plain.to_json()) | settings
     except (InputError, TypeError):
         return settings
 
@@ -79,17 +78,13 @@ def completed(settings: dict[str, Any]) -> dict[str, Any]:
 def restored(settings: dict[str, Any]) -> Run:
     """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
     run = _made(settings)
-    if _told(run) != settings:
+    if flat(run.to_json()) != settings:
         raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
     return run
 
 
 def _made(settings: dict[str, Any]) -> Run:
     return presets.make(**{name: value for name, value in settings.items() if not name.endswith(".class")})
-
-
-def _told(run: Run) -> dict[str, Any]:
-    return flat(json.loads(json.dumps(run.to_json())))
 
 
 def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:

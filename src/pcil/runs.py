@@ -129,7 +129,7 @@ def check(run: Run, folder: Path) -> None:
 def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
     """What must be equal in a folder's `run.json` for this run to go on there, as JSON gives it back."""
     about = demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean}
-    return json.loads(json.dumps({"run": run.to_json(), "demos": about}))
+    return {"run": run.to_json(), "demos": about}
 
 
 def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: loop.Reporter) -> None:
@@ -150,8 +150,7 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
         before = json.loads((folder / "run.json").read_text())
-        plain = json.loads(json.dumps(run.plain.to_json()))
-        changed = differences(completed(before["run"], plain), identity["run"])
+        changed = differences(completed(before["run"], run.plain.to_json()), identity["run"])
         changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(

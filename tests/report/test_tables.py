@@ -36,6 +36,25 @@ def test_finals(sweep: Collection) -> None:
     ]
 
 
+def test_overview(sweep: Collection, tmp_path: Path) -> None:
+    assert rows(tables.markdown(tables.overview(sweep))) == [
+        "| hopper_stand | 400.0 | 200.0 [-48.4, 448.4] | 100.0 [-24.2, 224.2] |",
+        "| walker_run | 1000.0 | 800.0 [551.6, 1048.4] | 400.0 [275.8, 524.2] |",
+    ]
+    fake_run(tmp_path / "a", [0.0, 30.0], "walker_run", "dac", expert=None)
+    fake_run(tmp_path / "b", [0.0, 40.0], "hopper_stand", "bc")
+    fake_run(tmp_path / "c", [0.0, 50.0], "hopper_stand", "pcil")
+    more_methods_than_tasks = [
+        "| method | hopper_stand | walker_run |",
+        "| --- | --- | --- |",
+        "| demonstrations | 800.0 |  |",
+        "| pcil | 50.0 |  |",
+        "| bc | 40.0 |  |",
+        "| dac |  | 30.0 |",
+    ]
+    assert tables.markdown(tables.overview(collect([tmp_path]))).splitlines() == more_methods_than_tasks
+
+
 def test_beside_the_paper(sweep: Collection) -> None:
     """The paper has 771.2 +- 142.1 on Hopper Stand and 778.4 +- 14.1 on Walker Run for PCIL, and nothing for DAC."""
     assert rows(tables.markdown(tables.paper(sweep))) == [

@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 
 from pcil.report import stats
-from pcil.report.load import Dot, Point, curves, matrix, read_run
+from pcil.report.load import Dot, Point, curves, label, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -46,7 +46,20 @@ STYLES = {
     "tcn-gail": Style("#5b4636", ">", (1, 2)),
     "expert": Style(GREY, "*", (3, 1, 1, 1)),
 }
-OTHERS = [Style(INK, "p"), Style("#0000c8", "h", (5, 2)), Style("#7f7f00", "d", (3, 2)), Style("#b000b0", "8", (7, 3, 1, 3))]
+OTHERS = [
+    Style(INK, "p"),
+    Style("#0000c8", "h", (5, 2)),
+    Style("#7f7f00", "d", (3, 2)),
+    Style("#b000b0", "8", (7, 3, 1, 3)),
+    Style("#006d77", "H", (1, 1)),
+    Style("#b85c00", "x", (4, 1)),
+    Style("#5a189a", "+", (8, 2)),
+    Style("#2e7d32", "1", (2, 4)),
+    Style("#c2185b", "2", (10, 2, 2, 2)),
+    Style("#455a64", "3", (5, 1, 1, 1)),
+    Style("#6d4c41", "4", (3, 3)),
+    Style("#0077b6", "|", (6, 1, 1, 1, 1, 1)),
+]
 """Methods that are not ours, in the order of their names; and variants of a method after its first."""
 
 
@@ -104,7 +117,7 @@ def grid(
         mine = curves(point for point in points if point.task == task)
         shown = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
         for name in (name for name in looks if (task, *name) in mine):
-            _seeds(axis, mine[task, *name], value, looks[name], _label(name, looks))
+            _seeds(axis, mine[task, *name], value, looks[name], label(name, looks))
         if value == "return_mean":
             experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
             shown += [_expert(axis, expert) for expert in experts if expert is not None]
@@ -131,7 +144,7 @@ def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], 
         tasks = strata[name]
         frames = np.array(sorted(set.intersection(*(set(own.tolist()) for own, _ in tasks))))
         scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        _line(axis, frames, stats.iqm(*scores), stats.bootstrap(stats.iqm, scores), looks[name], _label(name, looks))
+        _line(axis, frames, stats.iqm(*scores), stats.bootstrap(stats.iqm, scores), looks[name], label(name, looks))
         shown += stats.iqm(*scores).tolist()
     _expert(axis, 1.0)
     _finish(axis, _span("task", strata), "share of expert (IQM)", shown)
@@ -230,11 +243,6 @@ def _span(word: str, groups: Mapping[Any, Sized]) -> str:
     """How many of something the groups have, such as "2 to 3 seeds"."""
     counts = sorted({len(group) for group in groups.values()})
     return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
-
-
-def _label(name: tuple[str, str], looks: dict[tuple[str, str], Style]) -> str:
-    """The method, and its variant where there are several of it."""
-    return name[0] if [method for method, _ in looks].count(name[0]) == 1 else ", ".join(name)
 
 
 def _finish(axis: Axes, title: str, ylabel: str, shown: Sequence[float]) -> None:

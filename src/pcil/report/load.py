@@ -129,6 +129,11 @@ def curves(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[list[Row]]]:
     return {name: list(seeds.values()) for name, seeds in groups.items()}
 
 
+def label(name: tuple[str, str], names: Iterable[tuple[str, str]]) -> str:
+    """A method, and its variant where the names have several of it."""
+    return name[0] if [method for method, _ in names].count(name[0]) == 1 else ", ".join(name)
+
+
 def matrix(runs: Sequence[Sequence[Point]], value: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
     """The frames `[F]` at which every seed has the value, and the values `[seeds, F]`."""
     tables = [{p.frames: getattr(p, value) for p in run if getattr(p, value) is not None} for run in runs]

@@ -13,7 +13,7 @@ import numpy as np
 
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import Collection, Point, curves, matrix
+from pcil.report.load import Collection, Point, curves, label, matrix
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -51,6 +51,23 @@ def finals(found: Collection) -> Table:
         ours = stats.mean_interval(final), spread, stats.iqm_interval([final])
         rows.append((*name, *ours, *expert, len(final), frames))
     return Table((*KEY, "mean", "sd", "IQM", "expert", "of expert", "seeds", "frames"), rows)
+
+
+def overview(found: Collection) -> Table:
+    """Returns at a glance: the mean over seeds that the next tables explain, for each task, the demonstrations' beside it.
+
+    A blank was not run. The longer of the two axes goes down.
+    """
+    means, experts = {}, {}
+    for (task, *name), runs in curves(found.points).items():
+        means[task, tuple(name)] = stats.mean_interval(_final(runs)[1])
+        experts[task] = experts.get(task) or runs[0][-1].expert_return
+    names = list(dict.fromkeys(name for _, name in sorted(means, key=lambda key: key[1][0] != "pcil")))
+    columns: dict[str, list[Any]] = {"demonstrations": list(experts.values())}
+    columns |= {label(name, names): [means.get((task, name)) for task in experts] for name in names}
+    if len(names) > len(experts):
+        return Table(("method", *experts), [(word, *values) for word, values in columns.items()])
+    return Table(("task", *columns), list(zip(experts, *columns.values(), strict=True)))
 
 
 def paper(found: Collection) -> Table:
@@ -150,7 +167,7 @@ def representation(found: Collection) -> Table:
 
 Maker = Callable[[Collection], Table]
 MAKERS: dict[str, Maker] = {
-    make.__name__: make for make in (aggregate, finals, paper, efficiency, improvement, health, representation)
+    make.__name__: make for make in (overview, aggregate, finals, paper, efficiency, improvement, health, representation)
 }
 
 

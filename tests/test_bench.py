@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from pcil import bench, learner, presets
 from pcil.config import Run
+from pcil.envs.toy import PointMass
 from pcil.types import Batch, Spec, Window
 from small import small_run
 
@@ -148,6 +149,16 @@ def test_the_parts_that_are_timed_are_the_runs_own() -> None:
     setup.update(2)
     assert setup.count == 2 and not np.array_equal(setup.state.agent.actor.head.weights[0], before)
     assert float(setup.state.totals["updates"]) == 2
+
+
+def test_the_loop_is_timed_over_whole_episodes_and_left_as_it_was() -> None:
+    """Episodes 5 and 6 have 50 steps each, with an update every second step."""
+    update, step = learner.update, PointMass.step
+    run, parts = small_run("expert", frames=1000, evaluate_every=1000), [(learner, "update"), (PointMass, "step")]
+    timing = bench.time_loop(run, 0.0, parts)
+    assert timing.frames == timing.calls["step"] == 2 * timing.calls["update"] == 100
+    assert min(timing.inside.values()) > 0 and sum(timing.inside.values()) < timing.seconds
+    assert learner.update is update and PointMass.step is step
 
 
 def test_figures_have_the_names_of_the_design() -> None:

@@ -6,14 +6,15 @@ hold the same products of the same shapes.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 SINGLE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 KEYS = (
@@ -192,40 +193,64 @@ def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str
 
 
 def loop_share(run: Any, seconds: float) -> tuple[float, float]:
-    """Share of a real loop's time that is spent in the update, and frames a second, over whole episodes after compiling.
+    """Share of a real loop's time that is spent in the update, and frames a second."""
+    from pcil import learner
 
-    Each update is waited for here, which the loop itself does not do, so that its time is its own.
+    timing = time_loop(run, seconds, [(learner, "update")])
+    return timing.inside["update"] / timing.seconds, timing.frames / timing.seconds
+
+
+class Timing(NamedTuple):
+    """Some whole episodes of a loop."""
+
+    seconds: float
+    frames: int
+    inside: dict[str, float]
+    """Seconds in each part."""
+    calls: dict[str, int]
+    """How often each part was called."""
+
+
+def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Timing:
+    """Run a loop for about so many seconds after compiling, and time all calls of each `owner.name` of the parts.
+
+    Each call is waited for, which the loop itself does not do, so that its time is its own.
     """
     import jax
 
-    from pcil import learner, loop, runs
+    from pcil import loop, runs
 
-    inside, marks = 0.0, []  # an entry an episode: when it ended, the time spent in updates until then, its frames
-    original = learner.update
+    names = [name for _, name in parts]
+    inside, calls = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
+    ends: list[tuple[float, int, dict[str, float], dict[str, int]]] = []  # of each episode: time, frames, the two until then
 
-    def timed(*arguments: Any) -> Any:
-        nonlocal inside
-        start = time.perf_counter()
-        result = jax.block_until_ready(original(*arguments))
-        inside += time.perf_counter() - start
-        return result
+    def timed(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            start = time.perf_counter()
+            result = jax.block_until_ready(original(*arguments, **named))
+            inside[name] += time.perf_counter() - start
+            calls[name] += 1
+            return result
+
+        return call
 
     class Watch(runs.Silent):
         """Notes the end of each episode, and stops when there are enough."""
 
         def episode(self, run: Any, frames: int, total_reward: float) -> None:
-            marks.append((time.perf_counter(), inside, frames))
+            ends.append((time.perf_counter(), frames, dict(inside), dict(calls)))
 
         def stop(self) -> bool:
-            return len(marks) >= 6 and marks[-1][0] - marks[3][0] > seconds
+            return len(ends) >= 6 and ends[-1][0] - ends[3][0] > seconds
 
-    learner.update = timed
-    try:
-        with tempfile.TemporaryDirectory() as folder:
+    with contextlib.ExitStack() as stack:
+        for owner, name in parts:
+            original = getattr(owner, name)
+            stack.callback(setattr, owner, name, original)
+            setattr(owner, name, timed(name, original))
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        with contextlib.suppress(loop.Stopped):
             runs.execute(run, Path(folder) / "run", Watch())
-    except loop.Stopped:
-        pass
-    finally:
-        learner.update = original
-    (start, before, first), (end, after, last) = marks[3], marks[-1]
-    return (after - before) / (end - start), (last - first) / (end - start)
+    (start, first, inside_before, before), (end, last, inside_after, after) = ends[3], ends[-1]
+    within = {name: inside_after[name] - inside_before[name] for name in names}
+    return Timing(end - start, last - first, within, {name: after[name] - before[name] for name in names})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -246,6 +247,19 @@ def test_physics_is_reachable() -> None:
 @pytest.mark.parametrize("task", ["pendulum_swingup", "reacher_easy"])
 def test_gymnasiums_own_checks_pass(task: str) -> None:
     check_env(make(task).unwrapped, skip_render_check=True)
+
+
+def test_loading_says_nothing_and_mutes_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """dm_control's own call warns of cheetah's model file, so there is something not to say."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    with caplog.at_level(logging.WARNING, "absl"):
+        import_suite().load("cheetah", "run")
+        assert "deprecated" in caplog.text
+        caplog.clear()
+        DMCEnv("cheetah_run")
+        assert not caplog.text and logger.level == logging.WARNING
+    assert logger.level == level
 
 
 def test_names_that_are_none() -> None:

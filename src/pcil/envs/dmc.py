@@ -6,11 +6,13 @@ without its time steps, named indexing and dictionaries, and the observation bui
 
 from __future__ import annotations
 
+import contextlib
 import ctypes.util
 import importlib
+import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any
 
@@ -127,7 +129,8 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Loads model and task and prepares what a step calls."""
         from dm_control.rl import control
 
-        self._env = env = import_suite().load(self._domain, self._task, task_kwargs={"random": random})
+        with _model_warnings_unsaid():
+            self._env = env = import_suite().load(self._domain, self._task, task_kwargs={"random": random})
         self.num_substeps: int = env._n_sub_steps  # dm_control shows this and the limit nowhere else
         self._frame_limit: float = env._step_limit
         self._fill_observation, self._reward = (views_for(self.name) or generic_views)(env)
@@ -160,6 +163,18 @@ def checked_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         if not -1.0 <= value <= 1.0:
             raise ValueError(f"Every entry of an action must lie in [-1, 1]; got {value!r}.")
     return action
+
+
+@contextlib.contextmanager
+def _model_warnings_unsaid() -> Iterator[None]:
+    """MuJoCo calls some of dm_control's own model files deprecated, each time one is loaded; no user can change them."""
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def import_suite() -> ModuleType:

@@ -1,6 +1,6 @@
 """What learning looked like over spans of the runs of one method and task: python experiments/spans.py RUN ...
 
-Each cell is the range over the runs of the mean over a span's episodes, as `train.jsonl` has them.
+Each cell is the range over the runs of the mean over a span's episodes, as `train.jsonl` has them; a blank is what no run has.
 """
 
 import json
@@ -27,8 +27,8 @@ def main(*folders: str) -> None:
         cells = []
         for low, high in SPANS:
             spans = ([e[name] for e in log if low < e["frames"] / 1000 <= high and name in e] for log in logs)
-            means = [float(np.mean(span)) for span in spans]
-            cells.append(f" {min(means):.2f} to {max(means):.2f} |")
+            means = [float(np.mean(span)) for span in spans if span]
+            cells.append(f" {min(means):.2f} to {max(means):.2f} |" if means else " |")
         print(f"| {words} |{''.join(cells)}")
 
 

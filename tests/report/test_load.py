@@ -31,8 +31,8 @@ def test_each_evaluation_is_one_point(tmp_path: Path) -> None:
     """The correlation is that of the episodes since the evaluation before; half a line of a killed run is none."""
     points = read_run(make_run(tmp_path / "run"))
     assert points == [
-        Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.46, "abc+", 0.1, None),
-        Point("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.46, "abc+", 9.9, 0.375),
+        Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.456, "abc+", 0.1, None),
+        Point("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.456, "abc+", 9.9, 0.375),
     ]
 
 

@@ -116,7 +116,7 @@ def test_figures_and_tables_lie_beside_it(report: Path) -> None:
         names |= {f"curves-{task}", f"representation-{task}"}
     files = {path.name for path in (report.parent / "figures").iterdir()}
     assert files == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
-    tables = {"aggregate", "finals", "paper", "efficiency", "improvement", "health", "representation"}
+    tables = {"overview", "aggregate", "finals", "paper", "efficiency", "improvement", "health", "representation"}
     files = {path.name for path in (report.parent / "tables").iterdir()}
     assert files == {f"{name}.{kind}" for name in tables for kind in ("csv", "md")} | {"evaluations.csv", "transitions.csv"}
 

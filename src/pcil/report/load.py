@@ -149,7 +149,7 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
         episodes = [episode for line in whole if "correlation" in (episode := json.loads(line))]
         run, expert = about["run"], (about["demos"] or {}).get("return_mean")
         head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
-        tail = {"expert_return": expert and round(float(expert), 2), "commit": about["commit"] or ""}
+        tail = {"expert_return": expert and round(float(expert), 4), "commit": about["commit"] or ""}
         points, before = [], -1.0
         for frames in dict.fromkeys(columns["frames"].tolist()):
             now = columns["frames"] == frames

@@ -116,6 +116,18 @@ def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:
     assert all(half.std() > 0.03 for half in np.array_split(image, 2, axis=1))
 
 
+def test_a_long_legend_takes_nothing_from_the_panels(tmp_path: Path, drawn: list[Axes]) -> None:
+    """Twenty variants in one column, on paper that grows with them."""
+    few, many = (
+        [point for i in range(count) for point in curve("task", "pcil", 1, 1, 2, variant=f"default, some.setting_of_a_run={i}")]
+        for count in (2, 20)
+    )
+    figures.grid(few, tmp_path / "few")
+    figures.grid(many, tmp_path / "many")
+    heights = [axes.get_window_extent().height for axes in drawn]
+    assert 100 < heights[0] <= heights[1] < 1.3 * heights[0]
+
+
 def test_a_grid_shows_means_over_seeds_as_far_as_all_have_come(tmp_path: Path, drawn: list[Axes]) -> None:
     """Student's interval of two numbers is +- 12.706 half distances; the band is drawn although the axis may cut it."""
     figures.grid(curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6), tmp_path / "grid")

@@ -21,6 +21,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 matplotlib.rcParams["svg.hashsalt"] = "pcil"  # the same figure is the same file
+LEGEND_ROW = 0.18
+"""Inches that each further row of a legend adds to its figure."""
 INK, GREY, BLUE = "#1b1b1b", "#808080", "#1f5fbf"
 REWARD_COLOURS = LinearSegmentedColormap.from_list("reward", ["#0b3d1e", "#3f9b3a", "#ffe135"])
 """The paper's Figure 4: dark green for a low true reward, yellow for a high one."""
@@ -171,7 +173,9 @@ def save(figure: Figure, path: Path) -> str:
     lines = {name: line for name, line in lines.items() if not name.startswith("_")}
     if lines:
         fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of the words and of a line
-        look = {"ncols": max(min(fitting, len(lines)), 1), "frameon": False, "fontsize": 8}
+        columns = max(min(fitting, len(lines)), 1)
+        figure.set_figheight(figure.get_figheight() + LEGEND_ROW * (-(-len(lines) // columns) - 1))
+        look = {"ncols": columns, "frameon": False, "fontsize": 8}
         figure.legend(lines.values(), lines, loc="outside lower center", **look)
     figure.savefig(path.with_suffix(".png"), dpi=130)
     figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})

@@ -16,7 +16,8 @@ from pcil import envs, learner, loop, networks, presets, replay
 
 def main(task: str = "walker_walk") -> None:
     """A row a part: microseconds for each update, of one call, and the share."""
-    env = envs.make(presets.make(task).task)
+    run = presets.make(task)
+    env = envs.make(run.task)
     parts = [
         (learner, "update"),
         (type(env.unwrapped), "step"),
@@ -25,7 +26,7 @@ def main(task: str = "walker_walk") -> None:
         (loop, "on_host"),
         (learner, "label_episode"),
     ]
-    timing = bench.time_loop(presets.make(task), 20, parts)
+    timing = bench.time_loop(run, 20, parts)
     seconds = timing.inside | {"all else": timing.seconds - sum(timing.inside.values())}
     print(f"{'part':<16}{'us an update':>14}{'us a call':>12}{'share':>8}")
     for name, total in sorted(seconds.items(), key=lambda part: -part[1]):

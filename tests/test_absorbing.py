@@ -17,9 +17,12 @@ import numpy as np
 import pytest
 
 from pcil import envs, loop, runs
-from pcil.agents import DrQV2
+from pcil.agents import BC, DrQV2
+from pcil.errors import InputError
 from pcil.policy import Policy
+from pcil.replay import Replay
 from pcil.rewards import Reward
+from pcil.types import Episode
 from small import narrow, small_run
 
 GAMMA = 0.9
@@ -64,9 +67,9 @@ def _registered() -> Any:
     del gymnasium.registry[EXIT]
 
 
-def trained(pay: float, absorbing: bool, folder: Path) -> loop.State:
+def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> loop.State:
     """Uniform actions throughout, so that both kinds of action are seen whatever the agent would like."""
-    agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=1, absorbing=absorbing)
+    agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=n_step, absorbing=absorbing)
     changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
     run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=Constant(pay=pay))
     folder.mkdir()
@@ -87,9 +90,9 @@ def test_without_absorbing_states_an_end_is_worth_nothing(pay: float, tmp_path: 
     assert value(state, -0.9, False) == pytest.approx(stay, rel=0.15)
 
 
-@pytest.mark.parametrize("pay", [1.0, -1.0])
-def test_with_absorbing_states_an_end_is_worth_what_every_other_state_is(pay: float, tmp_path: Path) -> None:
-    state = trained(pay, True, tmp_path / "run")
+@pytest.mark.parametrize(("pay", "n_step"), [(1.0, 1), (-1.0, 1), (1.0, 3)])
+def test_with_absorbing_states_an_end_is_worth_what_every_other_state_is(pay: float, n_step: int, tmp_path: Path) -> None:
+    state = trained(pay, True, tmp_path / "run", n_step)
     for action in (0.9, -0.9):
         assert value(state, action, True) == pytest.approx(pay / (1 - GAMMA), rel=0.15)
 
@@ -99,3 +102,19 @@ def test_the_policy_of_an_absorbing_run_takes_the_environments_own_observations(
     policy: Policy = runs.load_policy(tmp_path / "run")
     assert policy.spec.obs_dim == envs.spec(envs.make(EXIT)).obs_dim == 1
     assert policy(np.zeros(1, np.float32)).shape == (1,)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("steps", [1, 2, 5])
+def test_the_absorbing_state_is_the_first_of_one_window_as_every_other_state(n: int, steps: int) -> None:
+    """So its value is learned, which every target near an end builds on."""
+    obs = np.arange(1, steps + 2, dtype=np.float32)[:, None]
+    episode = Episode(obs, np.zeros((steps, 1), np.float32), np.zeros(steps), terminated=True).absorbed(n)
+    window = Replay.of([episode]).sample(np.random.default_rng(0), 1000, n)
+    firsts, counts = np.unique(window.obs[:, 0], axis=0, return_counts=True)
+    assert firsts[:, 1].tolist() == [1.0] + [0.0] * steps and len(counts) == steps + 1
+
+
+def test_cloning_has_no_absorbing_states() -> None:
+    with pytest.raises(InputError, match="no absorbing states"):
+        BC(absorbing=True)

@@ -15,7 +15,7 @@ from pcil.agents import DrQV2
 from pcil.config import Run, completed, differences
 from pcil.envs import TASKS
 from pcil.errors import InputError
-from pcil.rewards import REWARDS, TaskReward
+from pcil.rewards import PCIL, REWARDS, TaskReward
 
 EVERY_RUN = sorted(presets.METHOD_SETTINGS)
 
@@ -215,3 +215,10 @@ def test_nested_settings_are_reached_by_dotted_names() -> None:
         presets.make("walker_walk", **{"agent.gama": 0.5})
     with pytest.raises(InputError, match="Run has no setting 'fames'"):
         presets.make("walker_walk", fames=5)
+
+
+def test_what_is_given_whole_keeps_its_settings_under_every_preset() -> None:
+    """A preset changes single settings of its own agent and reward, never of one that was given."""
+    assert presets.make("walker_walk", preset="released", reward=PCIL(batch_size=64)).reward == PCIL(batch_size=64)
+    agent = DrQV2(batch_size=512)
+    assert presets.make("walker_walk", "pwil", "released", agent=agent).agent == agent

@@ -9,13 +9,15 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
-from pcil import checkpoint, learner, loop, presets, runs
+from pcil import checkpoint, envs, learner, loop, presets, runs
 from pcil.config import Run
 from pcil.errors import InputError
 from pcil.metrics import WALL_CLOCK
@@ -77,6 +79,7 @@ CASES = [
     ("pcil-gail", "stored", {"penalty_every": 3, "stages": 2}),
     ("tcn-gail", "sampled", {}),
     *((name, "stored", {}) for name in ("pwil", "sil", "potil")),
+    ("bc", "sampled", {}),
 ]
 
 
@@ -85,6 +88,8 @@ def test_a_stopped_run_equals_an_uninterrupted_one(
     method: str, label: str, reward: dict[str, Any], demos: str, tmp_path: Path
 ) -> None:
     run = small_run(method, label=label, demos=demos, reward=reward)
+    if run.agent.offline:  # five passes
+        run = dataclasses.replace(run, frames=2300, seed_frames=0, evaluate_every=1000)
     finish(run, tmp_path / "whole")
     finish(run, tmp_path / "stopped", stops=(1, 2, 1))
     same_run(tmp_path / "whole", tmp_path / "stopped")
@@ -101,24 +106,21 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
 
-    class Crash(StopAfter):
-        """Saves once, then dies two episodes later."""
+    class Crash(runs.Silent):
+        """Dies at the end of its second episode."""
 
-        def stop(self) -> bool:
-            return self.left <= 0 and self._die()
+        episodes = 0
 
         def episode(self, run: Run, frames: int, total_reward: float) -> None:
-            self.left -= 1
-            if self.left == -2:
+            self.episodes += 1
+            if self.episodes == 2:
                 raise RuntimeError("the power went")
-
-        def _die(self) -> bool:
-            return False
 
     with pytest.raises(loop.Stopped):
         runs.execute(run, tmp_path / "crashed", StopAfter(2))
     with pytest.raises(RuntimeError, match="power"):
-        runs.execute(run, tmp_path / "crashed", Crash(0))
+        runs.execute(run, tmp_path / "crashed", Crash())
+    assert len(rows(tmp_path / "crashed")[1]) == 4, "two episodes more than the checkpoint has"
     finish(run, tmp_path / "crashed")
     same_run(tmp_path / "whole", tmp_path / "crashed")
 
@@ -349,3 +351,64 @@ def test_pcil_learns_to_walk_from_demonstrations(tmp_path: Path) -> None:
     first, last = ([float(row[2]) for row in table[1:] if row[0] == frames] for frames in ("0", "40000"))
     assert len(first) == len(last) == 10
     assert all(after > before for before, after in zip(first, last, strict=True))
+
+
+class Reused(gymnasium.Env):
+    """Counts its steps in one array that it hands out again and again; cut after four."""
+
+    observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._obs = np.zeros(1, np.float32)
+        return self._obs, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self._obs += 1
+        return self._obs, 0.0, False, False, {}
+
+
+@pytest.fixture
+def reused() -> Iterator[str]:
+    gymnasium.register("pcil_test/reused-v0", Reused, max_episode_steps=4)
+    yield "pcil_test/reused-v0"
+    del gymnasium.registry["pcil_test/reused-v0"]
+
+
+def test_an_episode_holds_each_observation_although_the_environment_reuses_its_buffer(reused: str) -> None:
+    run, env = small_run("expert", reused), envs.make(reused)
+    episode = loop.play(run, env, envs.spec(env), loop.start(run, envs.spec(env), ()))
+    assert episode.obs.tolist() == [[0], [1], [2], [3], [4]]
+
+
+def test_episodes_too_short_for_a_window_are_refused_when_updates_are_due(reused: str, tmp_path: Path) -> None:
+    agent = dataclasses.replace(small_run("expert").agent, n_step=5)
+    with pytest.raises(InputError, match=r"Every episode of pcil_test/reused-v0 so far is cut before the 5 steps"):
+        runs.execute(small_run("expert", reused, agent=agent), tmp_path / "run", runs.Silent())
+    assert [line["frames"] for line in rows(tmp_path / "run")[1]][-1] == 96, "refused at the first episode after 100 frames"
+
+
+def test_demonstrations_too_short_for_a_window_are_refused(demos: str, tmp_path: Path) -> None:
+    run = small_run("tcn", demos=demos, reward={"negatives": "rollout", "margin": 30})
+    with pytest.raises(InputError, match="are all shorter than the 60 steps"):
+        runs.execute(run, tmp_path / "run", runs.Silent())
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("rows", [60, 1000])
+def test_prefill_counts_the_steps_that_went_in_and_pays_them_alpha(rows: int, demos: str) -> None:
+    """120 steps are three demonstrations of 50; a replay of 60 rows keeps the last of them."""
+    run = small_run("pwil", demos=demos, replay_steps=rows, reward={"prefill_steps": 120, "alpha": 3.0, "task_weight": 0.5})
+    spec, episodes = envs.spec(envs.make(run.task)), runs.demonstrations(run).episodes
+    held = loop.start(run, spec, episodes).replay.state()
+    assert held["segments"][:, 3].tolist() == ([2] if rows == 60 else [0, 1, 2])
+    assert np.allclose(held["reward"][-51:-1], 3 + 0.5 * episodes[2].reward)
+
+
+def test_pwil_pays_alpha_for_every_step_of_a_copy_of_the_only_demonstration(demos: str) -> None:
+    """Expert and agent are compared by the same states of their steps."""
+    run = small_run("pwil", demos=demos, num_demos=1, reward={"alpha": 3.0})
+    (copy,) = runs.demonstrations(run).episodes
+    state = loop.start(run, envs.spec(envs.make(run.task)), [copy])
+    assert np.allclose(learner.label_episode(run.learner, state.learner, copy, 0), 3)

@@ -13,6 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
+from pcil.errors import InputError
+from pcil.rewards import POTIL
 from pcil.transport import sinkhorn_plan
 
 
@@ -40,7 +42,7 @@ def naive_plan(cost: np.ndarray, epsilon: float, rounds: int) -> np.ndarray:
     return np.exp(log_u[:, None] + kernel + log_v[None])
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, derandomize=True, max_examples=15)
 @given(rows=st.integers(1, 9), columns=st.integers(1, 9), rounds=st.integers(1, 40), seed=st.integers(0, 99))
 def test_plan_equals_a_naive_logarithmic_one(rows: int, columns: int, rounds: int, seed: int) -> None:
     """Round by round. A round that leaves no error ends the work, and further rounds would change nothing."""
@@ -58,6 +60,14 @@ def test_rows_have_their_mass_exactly_and_columns_nearly(epsilon: float) -> None
     assert (plan >= 0).all()
     assert np.allclose(plan.sum(axis=1), 1 / 40, atol=1e-7)
     assert np.allclose(plan.sum(axis=0), weight, atol=1e-6)
+
+
+def test_the_least_epsilon_still_moves_all_mass_at_the_largest_cost() -> None:
+    least = 3e-3
+    with pytest.raises(InputError, match="epsilon"):
+        POTIL(epsilon=0.99 * least)
+    plan = plan_of(2 - 0.1 * random_cost(30, 20, 2) / 2, POTIL(epsilon=least).epsilon, 100)
+    assert np.allclose(plan.sum(axis=1), 1 / 30, atol=1e-7)
 
 
 def test_cost_falls_to_that_of_the_exact_plan_as_epsilon_shrinks() -> None:

@@ -15,18 +15,18 @@ def make_episode(steps: int, terminated: bool) -> Episode:
 
 
 @settings(deadline=None, derandomize=True, max_examples=30)
-@given(st.integers(1, 9), st.booleans())
-def test_an_absorbed_episode_never_terminates_and_pays_the_same(steps: int, terminated: bool) -> None:
+@given(st.integers(1, 9), st.booleans(), st.integers(1, 4))
+def test_an_absorbed_episode_never_terminates_and_pays_the_same(steps: int, terminated: bool, rest: int) -> None:
     episode = make_episode(steps, terminated)
-    after = episode.absorbed()
+    after = episode.absorbed(rest)
     assert not after.terminated and after.seed == 3 and after.total_reward == episode.total_reward
-    assert len(after) == steps + terminated and after.obs.shape[1] == 3
+    assert len(after) == steps + terminated * rest and after.obs.shape[1] == 3
     real = steps if terminated else steps + 1  # observations that are kept
     assert np.array_equal(after.obs[:real, :2], episode.obs[:real]) and not after.obs[:real, 2].any()
     assert np.array_equal(after.action[:steps], episode.action) and np.array_equal(after.reward[:steps], episode.reward)
     if terminated:
-        assert np.array_equal(after.obs[-2:], [[0, 0, 1], [0, 0, 1]])
-        assert not after.action[-1].any() and after.reward[-1] == 0
+        assert np.array_equal(after.obs[steps:], [[0, 0, 1]] * (rest + 1))
+        assert not after.action[steps:].any() and not after.reward[steps:].any()
 
 
 def test_the_batch_of_an_episode_leaves_the_last_observation_out() -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil import seeds
 from pcil.config import Method
 from pcil.networks import Actor, Trunk
-from pcil.rewards import label, states_read
+from pcil.rewards import Reward, label, states_read
 from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec, Window
 
@@ -102,7 +102,7 @@ def _step(
 
 def close_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Learner:
     """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
-    if method.reward.scope == "step":
+    if type(method.reward).after_episode is Reward.after_episode:
         return learner
     reward = _after_rows(method, learner, episode.obs, episode.action, np.int32(count))
     return Learner(learner.agent, reward, learner.root, learner.totals)
@@ -117,11 +117,11 @@ def _after_rows(method: Method, learner: Learner, obs: Array, action: Array, cou
 def label_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
     """The reward of each step of one whole episode.
 
-    A reward of single steps is computed on a multiple of `LABEL_ROWS` rows, so that episodes of many lengths share a few
-    compilations; one of whole episodes is given exactly the episode.
+    A reward for which rows behind the end make no difference is computed on a multiple of `LABEL_ROWS` rows, so that episodes
+    of many lengths share a few compilations; another one is given exactly the episode.
     """
     steps = len(episode)
-    spare = -steps % LABEL_ROWS if method.reward.scope == "step" else 0
+    spare = -steps % LABEL_ROWS if method.reward.scope == "step" or method.reward.looks_back else 0
     obs, action = (np.pad(array, ((0, spare), (0, 0)), mode="edge") for array in (episode.obs, episode.action))
     true = np.pad(episode.reward.astype(np.float32), (0, spare))
     return np.asarray(_label_rows(method, learner, obs, action, true, np.int32(count)))[:steps]

@@ -16,14 +16,16 @@ import numpy as np
 
 from pcil import checkpoint, envs, learner, seeds
 from pcil.config import Run
+from pcil.errors import InputError
 from pcil.evaluate import Evaluation, evaluate
 from pcil.learner import Learner
 from pcil.metrics import MetricWriter, pearson
 from pcil.networks import Actor
 from pcil.policy import Policy
 from pcil.replay import Replay
+from pcil.rewards import states_read
 from pcil.seeds import Stream
-from pcil.types import Episode, Spec
+from pcil.types import Batch, Episode, Spec
 
 OFFLINE_STEPS = 500
 """Updates of an offline agent in one pass of the loop."""
@@ -95,10 +97,11 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
                 _log_pass(state, {}, log, clock)
             else:
                 episode = play(run, env, spec, state)
-                kept = episode.absorbed() if run.agent.absorbing else episode
+                kept = episode.absorbed(run.agent.n_step) if run.agent.absorbing else episode
                 state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
                 learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
                 state.replay.add(kept, learned if run.label == "stored" else kept.reward)
+                _refuse_short_episodes(run, state)
                 _log_pass(state, _described(episode, learned), log, clock)
                 reporter.episode(run, state.counters.frames, episode.total_reward)
 
@@ -122,7 +125,7 @@ def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
     act_rng = seeds.rng(run.seed, Stream.ACT, counters.episodes)
     sample_rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
     seed = seeds.episode_seed(run.seed, Stream.EPISODE, counters.episodes)
-    observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
+    observations, actions, rewards = [np.array(env.reset(seed=seed)[0], np.float32)], [], []
     explore = run.agent.explorer(spec.action_dim, act_rng)
     host: Actor | None = None
     over = terminated = False
@@ -136,7 +139,7 @@ def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
             counters, host = _update(run, state, state.replay, counters, sample_rng), None
         obs, reward, terminated, truncated, _ = env.step(action)
         over = terminated or truncated
-        observations.append(obs)
+        observations.append(np.array(obs, np.float32))  # a copy: the environment may reuse its buffer
         actions.append(action)
         rewards.append(reward)
         counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
@@ -148,8 +151,22 @@ def _update_due(run: Run, replay: Replay, counters: Counters) -> bool:
     return (
         counters.frames >= run.seed_frames
         and counters.steps % run.update_every == 0
-        and replay.num_windows(max(run.agent.n_step, run.reward.span)) > 0
+        and replay.num_windows(_window_steps(run)) > 0
     )
+
+
+def _window_steps(run: Run) -> int:
+    """Steps of the longest windows that an update draws."""
+    return max(run.agent.n_step, run.reward.span)
+
+
+def _refuse_short_episodes(run: Run, state: State) -> None:
+    """Raise `InputError` where updates are due and no window fits into any episode: nothing would ever be learned."""
+    if state.counters.frames >= run.seed_frames and not state.replay.num_windows(_window_steps(run)):
+        raise InputError(
+            f"Every episode of {run.task} so far is cut before the {_window_steps(run)} steps that an update needs; make its "
+            "time limit longer, or agent.n_step smaller."
+        )
 
 
 def _study(run: Run, spec: Spec, state: State) -> None:
@@ -231,25 +248,29 @@ def _evaluate(
 
 def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     """The state before the first step."""
+    played = demos
     if run.agent.absorbing:
-        demos, spec = [episode.absorbed() for episode in demos], spec._replace(obs_dim=spec.obs_dim + 1)
-    fresh = learner.init(run.learner, spec, tuple(episode.batch for episode in demos), run.seed)
+        played, demos = ([episode.absorbed(steps) for episode in demos] for steps in (run.agent.n_step, 1))
+        spec = spec._replace(obs_dim=spec.obs_dim + 1)
+    batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
+    fresh = learner.init(run.learner, spec, batches, run.seed)
     replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
-    steps, reward = run.reward.prefill
-    for episode in itertools.cycle(demos):
-        if replay.num_steps >= steps:
+    left, reward = run.reward.prefill
+    for episode in itertools.cycle(played):
+        if left <= 0:
             break
-        replay.add(episode, np.full(len(episode), reward, np.float32))
+        replay.add(episode, np.float32(reward + run.reward.task_weight * episode.reward))
+        left -= len(episode)
     actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
 
 
 def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
-    """Everything that the rest of the run depends on; a finished run needs no replay."""
+    """Everything that the rest of the run depends on; a finished run needs no replay, and an offline agent's is empty."""
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
     arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
-    if counters.final_return is None:
+    if counters.final_return is None and state.replay.num_episodes:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
     meta = {"counters": asdict(counters), "positions": log.positions()}
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
@@ -265,7 +286,8 @@ def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[St
     restored = checkpoint.unflatten("learner", fresh.learner, arrays)
     counters = Counters(**meta["counters"])
     if counters.final_return is None:
-        fresh.replay.load({name[7:]: array for name, array in arrays.items() if name.startswith("replay.")})
+        if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
+            fresh.replay.load(held)
         reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
     return State(restored, checkpoint.unflatten("actor", fresh.actor, arrays), fresh.replay, fresh.expert, counters), meta[
         "positions"

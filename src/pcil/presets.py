@@ -155,8 +155,9 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     settings: dict[str, Any] = {**PRESETS[preset](task), **METHOD_SETTINGS[method, preset]}
     nested = {name: settings.pop(name) for name in list(settings) if "." in name}
     run = Run(task=task, method=method, preset=preset, **settings)
-    if not changes.get("reward", run.reward).needs_demos:
+    if not run.reward.needs_demos:
         nested.pop("reward.batch_size", None)
+    nested = {name: value for name, value in nested.items() if name.partition(".")[0] not in changes}
     return changed(run, nested | changes)
 
 

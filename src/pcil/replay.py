@@ -67,11 +67,6 @@ class Replay:
         _, cumulative = self._starts(n)
         return int(cumulative[-1]) if len(cumulative) else 0
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the rows when the ring is full, in bytes."""
-        return self._obs.nbytes + self._action.nbytes + self._reward.nbytes
-
     def add(self, episode: Episode, reward: np.ndarray) -> None:
         """Append a whole episode, with the `reward [T]` to store for it."""
         rows = len(episode) + 1

@@ -75,19 +75,20 @@ class Episode:
         """The states in which an action was taken, and those actions."""
         return Batch(self.obs[:-1], self.action)
 
-    def absorbed(self) -> Episode:
+    def absorbed(self, steps: int = 1) -> Episode:
         """The same episode with a further entry in each observation, 1 in the absorbing state and 0 elsewhere.
 
         An episode that terminated ends in the absorbing state (zeros and the 1) in place of its last observation, and takes
-        one step from there to itself, with action and reward 0; so nothing terminates, and a reward learned on such episodes
-        values an early end as it values any other state (Kostrikov et al. 2019, section 4.2).
+        `steps` from there to itself, with action and reward 0; so nothing terminates, and a reward learned on such episodes
+        values an early end as it values any other state (Kostrikov et al. 2019, section 4.2). With `n` of them a window of `n`
+        steps can begin in the absorbing state, and does so once.
         """
         obs = np.pad(self.obs, ((0, 0), (0, 1)))
         if not self.terminated:
             return Episode(obs, self.action, self.reward, False, self.seed)
-        rest = np.zeros((2, obs.shape[1]), obs.dtype)
+        rest = np.zeros((steps + 1, obs.shape[1]), obs.dtype)
         rest[:, -1] = 1
-        action, reward = np.pad(self.action, ((0, 1), (0, 0))), np.pad(self.reward, (0, 1))
+        action, reward = np.pad(self.action, ((0, steps), (0, 0))), np.pad(self.reward, (0, steps))
         return Episode(np.concatenate([obs[:-1], rest]), action, reward, False, self.seed)
 
     @property

@@ -110,6 +110,22 @@ def test_a_real_gymnasium_env_works() -> None:
     assert obs.dtype == np.float32 and truncated  # its own time limit stays
 
 
+def test_an_episode_without_an_end_is_refused(register_env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Gymnasium knows no time limit; each episode is counted anew."""
+    monkeypatch.setattr(envs, "LONGEST_EPISODE", 5)
+    register_env("Dict-v0", DictEnv)
+    env, action = make("pcil_test/Dict-v0"), np.zeros(2, np.float32)
+    for _ in range(2):
+        env.reset(seed=0)
+        for _ in range(5):
+            env.step(action)
+    with pytest.raises(InputError, match=r"'pcil_test/Dict-v0' has not ended after 5 steps.*max_episode_steps"):
+        env.step(action)
+    limited = make("Pendulum-v1")
+    limited.reset(seed=0)
+    assert [limited.step(limited.action_space.sample())[3] for _ in range(6)] == [False] * 6
+
+
 @pytest.mark.parametrize(
     ("spaces_given", "message"),
     [

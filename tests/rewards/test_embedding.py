@@ -101,3 +101,11 @@ def test_the_four_rows_of_table_1_differ_in_representation_and_head_alone(preset
     for name in ("hidden", "learning_rate", "batch_size", "compare", "task_weight"):
         assert getattr(runs["pcil"].reward, name) == getattr(runs["tcn"].reward, name)
     assert runs["tcn"].reward.temperature == 0.07, "Appendix C.1"
+
+
+@pytest.mark.parametrize("settings", BOTH, ids=lambda s: type(s).__name__)
+def test_the_classifier_starts_from_draws_of_its_own(settings: PCIL | TCN) -> None:
+    """Independent normals: the classifier's first weights are not the encoder's, up to a factor."""
+    state = settings.init([random_batch(50, 6, 1)], itself, key=jax.random.key(0))
+    head, first = (np.asarray(net.weights[0]).ravel() for net in (state.classifier.linear, state.encoder))
+    assert abs(np.corrcoef(head, first[: len(head)])[0, 1]) < 0.999

@@ -61,7 +61,7 @@ def test_coupling_by_hand() -> None:
     assert np.allclose(GREEDY(column(0, 4), column(1, 2, 3, 9), jnp.int32(4)), [1, 2, 1, 5])
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, derandomize=True, max_examples=40)
 @given(
     atoms=st.integers(1, 7),
     points=st.sampled_from([1, 4, 9]),
@@ -75,7 +75,7 @@ def test_costs_equal_those_of_a_naive_coupling_step_by_step(atoms: int, points: 
     assert np.allclose(distances / horizon, naive_costs(a, x, horizon), rtol=1e-5, atol=1e-7)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, derandomize=True, max_examples=25)
 @given(atoms=st.sampled_from([1, 5]), horizon=st.integers(1, 12), seed=st.integers(0, 999))
 def test_mass_is_conserved_and_a_full_atom_gets_no_more(atoms: int, horizon: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -89,7 +89,7 @@ def test_mass_is_conserved_and_a_full_atom_gets_no_more(atoms: int, horizon: int
     assert not np.asarray(left).any(), "an episode of the horizon's length fills every atom"
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, derandomize=True, max_examples=25)
 @given(atoms=st.sampled_from([2, 7]), horizon=st.sampled_from([3, 6]), seed=st.integers(0, 999))
 def test_the_greedy_coupling_costs_at_least_the_exact_one(atoms: int, horizon: int, seed: int) -> None:
     """Over a whole episode it is a coupling of the two measures, so its cost bounds the Wasserstein distance from above."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Explorer, Metrics
-from pcil.errors import check_ranges
+from pcil.errors import InputError, check_ranges
 from pcil.networks import Actor, Trunk
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
@@ -45,6 +45,8 @@ class BC(Agent):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.absorbing:
+            raise InputError("BC plays no episode that could end, so it has no absorbing states; leave agent.absorbing out.")
         check_ranges(self, learning_rate=(0, 1), deviation=(1e-6, inf), feature_dim=(1, inf), hidden=(1, inf))
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> BCState:

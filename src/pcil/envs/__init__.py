@@ -29,6 +29,9 @@ TASKS = (
 )
 """The ten tasks of the paper (Appendix A), all from DeepMind Control."""
 
+LONGEST_EPISODE = 100_000
+"""Steps after which an environment without a time limit is taken to have no end."""
+
 _TOYS = {
     "toy/point_mass-v0": "PointMass",
     "toy/probe_1-v0": "ConstantReward",
@@ -85,7 +88,30 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
         raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
-        return _flat_actions(_flat_observations(env, task), task)
+        env = _flat_actions(_flat_observations(env, task), task)
+    limited = env.spec is None or env.spec.max_episode_steps is not None or env.spec.namespace in ("dmc", "toy")
+    return env if limited else _Ending(env, task)
+
+
+class _Ending(gymnasium.Wrapper):
+    """Refuses an episode that does not end: Gymnasium knows no time limit of this environment."""
+
+    def __init__(self, env: gymnasium.Env, task: str) -> None:
+        super().__init__(env)
+        self._task, self._steps = task, 0
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        self._steps = 0
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        if self._steps > LONGEST_EPISODE:
+            raise InputError(
+                f"An episode of {self._task!r} has not ended after {LONGEST_EPISODE:,} steps, and pcil learns between episodes: "
+                "register it with max_episode_steps."
+            )
+        return self.env.step(action)
 
 
 def spec(env: gymnasium.Env) -> Spec:

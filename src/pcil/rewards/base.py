@@ -43,10 +43,12 @@ class Reward(abc.ABC):
     """An imitation reward: learned from demonstrations and from what the agent does.
 
     `scope` says what `reward` must be given: "step" for any steps in any order, "episode" for one whole episode in the order
-    of time. `needs_demos` is False where no demonstrations are used at all.
+    of time. `looks_back` says of the latter that a step's reward depends on no later step. `needs_demos` is False where no
+    demonstrations are used at all.
     """
 
     scope: ClassVar[Literal["step", "episode"]] = "step"
+    looks_back: ClassVar[bool] = False
     needs_demos: ClassVar[bool] = True
 
     task_weight: float = 0.0
@@ -80,7 +82,8 @@ class Reward(abc.ABC):
 
     @abc.abstractmethod
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> Any:
-        """The state before the first update; `demos` has the states and actions of each demonstration, in the order of time.
+        """The state before the first update; `demos` has the states that the reward `reads` and the actions of each
+        demonstration, in the order of time.
 
         It is compiled, so it computes with JAX.
         """
@@ -125,7 +128,7 @@ class Reward(abc.ABC):
         return None
 
 
-def states_read(settings: Reward, obs: Float[Array, "*batch states obs"]) -> Float[Array, "*batch n obs"]:
+def states_read(settings: Reward, obs: Float[Any, "*batch states obs"]) -> Float[Any, "*batch n obs"]:
     """The states that a reward `reads`, one a step."""
     return obs[..., 1:, :] if settings.reads == "next_obs" else obs[..., :-1, :]
 

@@ -41,12 +41,12 @@ def init_embedding(
     demos: Sequence[Batch], embed: Embed, *, hidden: int, batch_size: int, head: Head, key: PRNGKeyArray
 ) -> EmbeddingState:
     """Three hidden layers and a quarter of their width as output (256-256-256-64: paper Appendix B); random references."""
-    encoder_key, reference_key = jax.random.split(key)
+    encoder_key, reference_key, head_key = jax.random.split(key, 3)
     states = jnp.concatenate([demo.obs for demo in demos])
     reference = states[jax.random.randint(reference_key, (batch_size,), 0, states.shape[0])]
     features = jax.eval_shape(embed, reference).shape[-1]
     encoder = MLP.init((features, hidden, hidden, hidden, hidden // 4), key=encoder_key)
-    linear = MLP.init((hidden // 4, 1), key=jax.random.fold_in(key, 0)) if head == "gail" else None
+    linear = MLP.init((hidden // 4, 1), key=head_key) if head == "gail" else None
     return EmbeddingState(encoder, adam_init(encoder), reference, linear and Classifier(linear, adam_init(linear)))
 
 

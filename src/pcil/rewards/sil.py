@@ -64,7 +64,7 @@ class SinkhornReward(Reward):
     scope: ClassVar[Literal["step", "episode"]] = "episode"
 
     epsilon: float = 0.01
-    """Weight of the plan's entropy."""
+    """Weight of the plan's entropy; costs reach 2, and `exp(-cost / epsilon)` is 0 in float64 beyond 745."""
     iterations: int = 100
     """Rounds of Sinkhorn's algorithm, at most."""
     first_sum: float = -10.0
@@ -72,7 +72,7 @@ class SinkhornReward(Reward):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(self, epsilon=(1e-3, inf), iterations=(1, inf), first_sum=(-inf, 0))
+        check_ranges(self, epsilon=(3e-3, inf), iterations=(1, inf), first_sum=(-inf, 0))
 
     @abc.abstractmethod
     def costs(

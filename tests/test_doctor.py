@@ -32,13 +32,13 @@ def test_only_what_training_needs_fails(
     needed: bool, code: int, mark: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What was raised and the remedy are shown as they are: brackets are no markup."""
-    checks = (("well", lambda: "found it", "-", True), ("ill", broken, "pip install 'pcil[report]'", needed))
+    checks = (("well", lambda: "found it", "-", True), ("ill", broken, "pip install '.[report]' in a clone", needed))
     monkeypatch.setattr(doctor, "CHECKS", checks)
     assert doctor.report() == code
     out = capsys.readouterr().out
     assert "ok" in out and "found it" in out
     assert mark in out and "RuntimeError: it is [/bold] gone" in out and "two lines" not in out
-    assert "pip install 'pcil[report]'" in out
+    assert "pip install '.[report]' in a clone" in out
 
 
 def test_mujoco_4_is_said_to_be_wrong(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -391,7 +391,7 @@ def test_episodes_too_short_for_a_window_are_refused_when_updates_are_due(reused
 
 def test_demonstrations_too_short_for_a_window_are_refused(demos: str, tmp_path: Path) -> None:
     run = small_run("tcn", demos=demos, reward={"negatives": "rollout", "margin": 30})
-    with pytest.raises(InputError, match="are all shorter than the 60 steps"):
+    with pytest.raises(InputError, match="are all shorter than the 60 steps that an update draws"):
         runs.execute(run, tmp_path / "run", runs.Silent())
     assert not (tmp_path / "run").exists()
 

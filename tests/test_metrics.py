@@ -172,17 +172,17 @@ series = arrays.arrays(np.float64, 6, elements=st.integers(-100, 100).map(float)
 def test_the_correlation_is_the_covariance_over_both_deviations(x: np.ndarray, y: np.ndarray) -> None:
     varies = len(set(x)) > 1 and len(set(y)) > 1
     covariance = sum(a * b for a, b in zip(x, y, strict=True)) / 6 - sum(x) / 6 * sum(y) / 6
-    expected = covariance / (np.std(x) * np.std(y)) if varies else 0.0
-    assert pearson(x, y) == pytest.approx(expected, abs=1e-9)
+    expected = pytest.approx(covariance / (np.std(x) * np.std(y)), abs=1e-9) if varies else None
+    assert pearson(x, y) == expected
 
 
 @pytest.mark.parametrize("constant", [0.0, 1.0, 0.1, 33.3, 1000.1])
 @pytest.mark.parametrize("length", [7, 500, 501])
-def test_what_does_not_vary_correlates_with_nothing(constant: float, length: int) -> None:
+def test_what_does_not_vary_has_no_correlation(constant: float, length: int) -> None:
     """Also where the mean of equal float32 numbers is not that number."""
     flat, line = np.full(length, constant, np.float32), np.linspace(0.0, 1.0, length, dtype=np.float32)
-    assert pearson(flat, line) == 0
-    assert pearson(line, flat) == 0
-    assert pearson(flat, 0.3 * flat + 5.7) == 0
+    assert pearson(flat, line) is None
+    assert pearson(line, flat) is None
+    assert pearson(flat, 0.3 * flat + 5.7) is None
     assert pearson(line, 2 * line + 1) == pytest.approx(1)
     assert pearson(line, -line) == pytest.approx(-1)

@@ -19,6 +19,7 @@ from pcil import presets
 from pcil.rewards import REWARDS
 
 PACKAGE = Path(pcil.__file__).parent
+ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
@@ -95,6 +96,19 @@ def test_the_report_imports_no_jax() -> None:
     assert set().union(*(parts_imported(path) for path in SOURCES if part(path) == "report")) == {"report", "errors", "theory"}
     lazily = {name for path in SOURCES if part(path) == "report" for name in imported(path)}
     assert not any(re.match(r"(jax|equinox|optax)\b", name) for name in lazily)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from pcil.cli import main; assert main(['report', RESULTS, '--out', 'out']) == 0",
+        "sys.path.insert(0, EXPERIMENTS); import results; assert results.main(['--check']) in (0, 1)",
+    ],
+)
+def test_figures_and_tables_are_made_of_results_alone_without_jax(code: str) -> None:
+    places = f"RESULTS, EXPERIMENTS = {str(ROOT / 'results' / 'pcil-200k.csv')!r}, {str(ROOT / 'experiments')!r}"
+    none = "assert not {'jax', 'equinox', 'optax'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", f"import sys; {places}; {code}; {none}"], check=True, stdout=subprocess.DEVNULL)
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: "/".join(path.relative_to(PACKAGE).parts))

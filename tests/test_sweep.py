@@ -212,7 +212,7 @@ def test_a_finished_sweep_needs_no_ray(demos: str, monkeypatch: pytest.MonkeyPat
     assert capsys.readouterr().out == "0 of 2 runs are left to do.\n2 of 2 runs are done.\n"
     shutil.rmtree("out")
     assert cli.main(["sweep", "sweep.toml", "--out", "out"]) == 2
-    assert "pip install 'pcil[sweep]'" in capsys.readouterr().err
+    assert "pip install '.[sweep]' in a clone" in capsys.readouterr().err
 
 
 def test_the_table_says_where_every_run_is() -> None:

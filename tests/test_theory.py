@@ -502,7 +502,8 @@ def test_without_matplotlib_it_says_what_to_install(
     monkeypatch.delitem(sys.modules, "pcil.report.figures", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["theory"]) == 0
-    assert capsys.readouterr().out.endswith("No figure is drawn without matplotlib; pip install 'pcil[report]' brings it.\n")
+    told = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
+    assert capsys.readouterr().out.splitlines()[-1] == told
     assert not list(tmp_path.iterdir())
 
 

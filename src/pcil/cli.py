@@ -80,7 +80,7 @@ def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
     try:
         from pcil.report import figures
     except ImportError:
-        bar.say("No learning curve is drawn without matplotlib; pip install 'pcil[report]' brings it.")
+        bar.say("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
     else:
         bar.say(f"Learning curve: {figures.run_curve(out, expert)}")
 
@@ -214,7 +214,7 @@ def _theory(words: list[str]) -> int:
             try:
                 from pcil.report.theory import draw
             except ImportError:
-                drawn = "No figure is drawn without matplotlib; pip install 'pcil[report]' brings it."
+                drawn = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
             else:
                 drawn = f"Figure: {draw(pairs, out or Path())}"
         print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")

@@ -28,7 +28,7 @@ def report() -> int:
             found, advice = f"{type(error).__name__}: {error}".splitlines()[0][:90], remedy
             mark = "[red]wrong[/]" if needed else "[yellow]absent[/]"
             broken |= needed
-        table.add_row(mark, name, Text(found), Text(advice))  # brackets, as in pcil[report], are text and no markup
+        table.add_row(mark, name, Text(found), Text(advice))  # brackets, as in .[report], are text and no markup
     Console().print(table)
     return int(broken)
 
@@ -107,12 +107,12 @@ CHECKS: tuple[Check, ...] = (
     ("Python", _python, "install Python 3.11 or newer", True),
     ("networks", _versions("equinox", "optax", "numpy"), "pip install --force-reinstall pcil", True),
     ("physics", _mujoco, "pip install 'mujoco<4'", True),
-    ("device", _devices, "pip install --force-reinstall jax; for a GPU: pip install 'pcil[cuda]'", True),
+    ("device", _devices, "pip install --force-reinstall jax; for a GPU: pip install '.[cuda]' in a clone", True),
     ("environment", _environment, "pip install --force-reinstall dm-control 'mujoco<4'", True),
     ("demonstrations", _demonstrations, "pip install --force-reinstall pcil, or give --demos", False),
     ("compilation cache", _cache, "set JAX_COMPILATION_CACHE_DIR to a folder that can be written", False),
-    ("figures", _importable("matplotlib", "matplotlib"), "pip install 'pcil[report]'", False),
+    ("figures", _importable("matplotlib", "matplotlib"), "pip install '.[report]' in a clone", False),
     ("optimal transport", _importable("ot", "pot"), "pip install --force-reinstall pot", False),
-    ("sweeps", _importable("ray", "ray"), "pip install 'pcil[sweep]'", False),
+    ("sweeps", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
     ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
 )

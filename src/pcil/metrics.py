@@ -73,8 +73,8 @@ class MetricWriter:
         self._files[name].flush()
 
 
-def pearson(x: np.ndarray, y: np.ndarray) -> float:
-    """Pearson correlation; 0 where one of the two does not vary."""
+def pearson(x: np.ndarray, y: np.ndarray) -> float | None:
+    """Pearson correlation; None where one of the two does not vary."""
     if np.ptp(x) == 0 or np.ptp(y) == 0:
-        return 0.0
+        return None
     return float(np.corrcoef(x.astype(np.float64), y.astype(np.float64))[0, 1])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from pcil import film, representation
 from pcil.errors import InputError
 
 
@@ -27,14 +26,24 @@ def report(
     try:
         from pcil.report import load, page
     except ImportError as error:
-        raise InputError(f"A report needs {error.name}, which pip install 'pcil[report]' brings.") from error
-    found = load.collect(paths, representation.completed)
+        raise InputError(f"A report needs {error.name}, which pip install '.[report]' in a clone brings.") from error
+    found = load.collect(paths, _completed)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
-    if rollouts:
+    films: dict[str, bytes] = {}
+    if rollouts and found.sources:
+        from pcil import film, representation
+
         representation.add(found)
-    films = film.films(found) if rollouts else {}
+        films = film.films(found)
     print("\n".join([*found.notes, f"Report: {page.build(found, out, films)}"]))
     return 0
+
+
+def _completed(settings: dict[str, Any]) -> dict[str, Any]:
+    """`pcil.representation:completed`, which loads JAX: a report of files of results alone does without."""
+    from pcil.representation import completed
+
+    return completed(settings)

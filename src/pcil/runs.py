@@ -100,7 +100,9 @@ def demonstrations(run: Run) -> Demonstrations | None:
     demos = Demonstrations.load(source).take(run.num_demos).validate(envs.spec(environment))
     steps = max(run.reward.span if run.reward.batch_size else 1, run.agent.n_step if run.agent.offline else 1)
     if all(len(episode) < steps and not episode.terminated for episode in demos.episodes):
-        raise InputError(f"The demonstrations of {run.task} are all shorter than the {steps} steps that an update draws at once.")
+        raise InputError(
+            f"The demonstrations of {run.task} are all shorter than the {steps} steps that an update draws in a row."
+        )
     return demos
 
 

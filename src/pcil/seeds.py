@@ -6,8 +6,8 @@ A new consumer takes a new stream and shifts no other; a resumed run continues w
 from __future__ import annotations
 
 import enum
+from typing import Any
 
-import jax
 import numpy as np
 
 
@@ -32,8 +32,10 @@ class Stream(enum.IntEnum):
     """Resets while demonstrations are recorded; the counter is the attempt."""
 
 
-def key(root: jax.Array, stream: Stream, counter: int | jax.Array) -> jax.Array:
-    """The JAX key of one draw; `counter` may be traced."""
+def key(root: Any, stream: Stream, counter: Any) -> Any:
+    """The JAX key of one draw, from the run's root key; `counter` may be traced."""
+    import jax  # here: what reads demonstrations and draws figures needs no JAX
+
     return jax.random.fold_in(jax.random.fold_in(root, int(stream)), counter)
 
 

@@ -85,7 +85,7 @@ def _cluster(plan: Plan, limit: int | None, address: str | None) -> Iterator[Any
     try:
         import ray
     except ImportError as error:
-        raise InputError("pcil sweep needs Ray; pip install 'pcil[sweep]' brings it.") from error
+        raise InputError("pcil sweep needs Ray; pip install '.[sweep]' in a clone brings it.") from error
     if address and ":" in address:
         try:
             host, _, port = address.rpartition(":")

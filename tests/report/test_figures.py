@@ -177,6 +177,16 @@ def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) 
     assert np.allclose(axes.collections[0].get_datalim(axes.transData).intervaly, [0, 0.85])
 
 
+def test_a_method_without_steps_is_a_level_line(tmp_path: Path, drawn: list[Axes]) -> None:
+    """At the mean of its seeds' last returns; together with other tasks at its share."""
+    points = curve("a", "bc", 1, 0, 1, 4) + curve("a", "bc", 2, 0, 1, 6)
+    points += curve("a", "pcil", 1, 0, 9) + curve("b", "pcil", 1, 0, 9)
+    figures.grid(points, tmp_path / "grid", columns=2)
+    figures.aggregate(points, tmp_path / "all", figures.styles(points))
+    assert lines(drawn[0])["bc"] == [5, 5] and drawn[0].get_title() == "a, 1 to 2 seeds"
+    assert lines(drawn[2]) == {"pcil (2 tasks)": [0, 1], "bc (1 task)": [pytest.approx(5 / 9)] * 2, "demos": [1, 1]}
+
+
 def test_without_an_expert_there_is_nothing_to_put_together(tmp_path: Path) -> None:
     points = curve("a", "pcil", 1, 0, 5, expert=None)
     assert figures.aggregate(points, tmp_path / "all", figures.styles(points)) == "" and not list(tmp_path.iterdir())
@@ -237,6 +247,7 @@ def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes])
 
     dots = transitions("a", "dac", 1, 10) + transitions("a", "dac", 2, 50)
     dots += transitions("a", "pcil", 1, 20) + transitions("b", "pcil", 1, 30)
+    dots += [Dot("a", "pcil", "default", 1, 5000, 5.0, 1.0, 0.5, 20.0, 9.0)]
     figures.clouds(dots, tmp_path / "clouds")
     panels = [axes for axes in drawn if axes.get_title()]
     assert [axes.get_title().split(",")[:2] for axes in panels] == [["a", " dac"], ["a", " pcil"], ["b", " pcil"]]
@@ -244,6 +255,7 @@ def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes])
     assert np.asarray(agent.get_offsets()).tolist() == [[11, 1], [12, 3]]
     assert expert.get_xydata().tolist() == [[10, 0]] and expert.get_label() == "expert"
     assert agent.get_array().tolist() == [0, 2]
+    assert [axes.collections[0].get_clim() for axes in panels] == [(0, 5), (0, 5), (0, 2)], "a task has one scale of colours"
     red, green, blue = to_rgb(expert.get_color())
     assert blue > green > red, "experts are blue"
     low, high = figures.REWARD_COLOURS([0.0, 1.0])

@@ -12,7 +12,7 @@ from fake_runs import fake_run, fake_sweep
 from pcil.config import MACHINE_SETTINGS
 from pcil.errors import InputError
 from pcil.report import load
-from pcil.report.load import Dot, Point, collect, curves, flat, matrix, read_points, read_run, write_points
+from pcil.report.load import Dot, Point, collect, curves, flat, label, matrix, read_points, read_run, write_points
 
 
 def make_run(folder: Path) -> Path:
@@ -22,13 +22,14 @@ def make_run(folder: Path) -> Path:
     (folder / "run.json").write_text(json.dumps(about))
     rows = ["frames,episode,return,length,seconds", "0,0,1.0,500,0.1", "0,1,4.0,500,0.1", "20000,0,10.25,500,9.9"]
     (folder / "eval.csv").write_text("\n".join([*rows, "20000,1,10.75,500,9.9"]) + "\n")
-    health = ((1000, 0.5), (20000, 0.25), (20001, 9.0))
+    health = ((1000, 0.5), (9000, "null"), (10000, 0.0), (20000, 0.25), (20001, 9.0))
     (folder / "train.jsonl").write_text("".join(f'{{"frames": {f}, "correlation": {c}}}\n' for f, c in health) + '{"frames": 2')
     return folder
 
 
 def test_each_evaluation_is_one_point(tmp_path: Path) -> None:
-    """The correlation is that of the episodes since the evaluation before; half a line of a killed run is none."""
+    """The correlation is that of the episodes since the evaluation before which have one: null is none, and so is the 0 of
+    older logs. Half a line of a killed run is no episode."""
     points = read_run(make_run(tmp_path / "run"))
     assert points == [
         Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.456, "abc+", 0.1, None),
@@ -111,6 +112,17 @@ def test_a_csv_gives_the_same_points_as_its_runs(tmp_path: Path) -> None:
     assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).points == found.points, "no seed counts twice"
 
 
+def test_a_run_in_two_files_is_whole_and_of_the_first(tmp_path: Path) -> None:
+    """Never the first frames of one and the last of the other."""
+    short, long = tmp_path / "short.csv", tmp_path / "long.csv"
+    for seed, path, returns in ((1, short, [1, 2]), (2, long, [3, 4, 5])):
+        runs = [fake_run(tmp_path / f"a{seed}", returns), fake_run(tmp_path / f"b{seed}", [9], method="dac", seed=seed)]
+        write_points(path, collect(runs).points)
+    both = collect([short, long])
+    assert [point.return_mean for point in both.points] == [1, 2, 9, 9], "DAC's two seeds are of one file each"
+    assert both.notes == [f"{long} holds runs that {short} has too; those of the latter are shown."]
+
+
 def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path) -> None:
     """What differs on one task names the variant on every task, so that variants can be compared over tasks."""
     fake_run(tmp_path / "a", [1], seed=1, checkpoint_seconds=1)
@@ -183,6 +195,12 @@ def test_a_matrix_has_the_frames_that_all_seeds_have(tmp_path: Path) -> None:
     assert frames.tolist() == [0, 2000] and values.tolist() == [[1, 3], [4, 5]]
     frames, values = matrix(runs, "correlation")
     assert frames.tolist() == [2000] and np.allclose(values, [[0.6], [0.7]])
+
+
+def test_a_label_says_the_variant_unless_it_is_the_default_presets_alone() -> None:
+    one, other, alone, paper = ("pcil", "default"), ("pcil", "paper"), ("dac", "default"), ("sil", "paper")
+    names = [one, other, alone, paper]
+    assert [label(name, names) for name in names] == ["pcil, default", "pcil, paper", "dac", "sil, paper"]
 
 
 def test_nested_settings_are_flat_by_their_dotted_names() -> None:

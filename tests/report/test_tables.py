@@ -100,8 +100,9 @@ def test_sample_efficiency(tmp_path: Path) -> None:
     for seed, returns in enumerate(([0.0, 400.0, 650.0, 730.0], [0.0, 0.0, 500.0, 500.0], [0.0, 0.0, 0.0, 0.0]), 1):
         fake_run(tmp_path / str(seed), returns, seed=seed)
     fake_run(tmp_path / "no expert", [0.0, 1.0], "hopper_hop", expert=None)
+    fake_run(tmp_path / "cloned", [0.0, 800.0], method="bc")
     assert rows(tables.markdown(tables.efficiency(collect([tmp_path])))) == [
-        "| walker_run | pcil | default | 2,000 | 1.00 | 2 |  |  | 1 |  |  | 1 | 3 |"
+        "| walker_run | pcil | default | 2,000 | 1.00 | 2 |  |  | 1 |  |  | 1 | 3 | 3,000 |"
     ]
 
 
@@ -110,6 +111,17 @@ def test_probability_of_improvement(sweep: Collection) -> None:
     ((*names, chance, tasks),) = tables.improvement(sweep).rows
     assert names == ["pcil", "default", "dac", "default"] and tasks == 2
     assert chance.value == pytest.approx((7.5 / 9 + 1) / 2) and chance.low < chance.value < chance.high == 1
+
+
+def test_methods_are_compared_at_the_frames_that_both_have(tmp_path: Path) -> None:
+    """PCIL ends at 9 after 3000 frames, and is behind at 1000, where DAC ends; BC's frames are no steps, so its end counts."""
+    fake_run(tmp_path / "a", [0.0, 1.0, 5.0, 9.0], method="pcil")
+    fake_run(tmp_path / "b", [0.0, 2.0], method="dac")
+    fake_run(tmp_path / "c", [0.0, 8.0], method="bc")
+    found = collect([tmp_path])
+    chances = {(row[0], row[2]): row[4].value for row in tables.improvement(found).rows}
+    assert chances == {("pcil", "bc"): 1, ("pcil", "dac"): 0, ("bc", "dac"): 1}
+    assert rows(tables.markdown(tables.overview(found)))[1:] == ["| pcil | 9.00 |", "| bc | 8.00 |", "| dac | 2.00 at 1,000 |"]
 
 
 def test_methods_without_a_common_task_are_not_compared(tmp_path: Path) -> None:

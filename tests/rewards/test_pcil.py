@@ -312,6 +312,20 @@ def test_the_agent_is_trained_on_the_weighted_sum() -> None:
     assert targets[1] - targets[0] == pytest.approx(0.5 * 3 * discounts, rel=1e-4)
 
 
+def test_actions_make_no_difference() -> None:
+    """The encoder is a function of the state (section 3.2), whatever Eq. 1 says of pairs."""
+    demo, seen = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
+    learned = []
+    for factor in (1, -1):
+        batches = [Batch(batch.obs, batch.action * factor) for batch in (demo, seen)]
+        state = SETTINGS.init(batches[:1], lambda obs: obs, key=jax.random.key(0))
+        state, _ = update(SETTINGS, state, *map(windows, batches), key=jax.random.key(1))
+        embed = {"embed": lambda obs: obs, "key": jax.random.key(2)}
+        paid = SETTINGS.reward(state, jnp.asarray(batches[1].obs), jnp.asarray(batches[1].action), **embed)
+        learned.append([*jax.tree.leaves(state), paid])
+    assert all(np.array_equal(one, other) for one, other in zip(*learned, strict=True))
+
+
 def test_nothing_flows_into_the_agents_features() -> None:
     """Encoder updates stop at the features, as in the authors' agent/pcil.py: the loop's embed blocks the gradient."""
     run = small_run()

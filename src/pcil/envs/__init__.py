@@ -108,8 +108,8 @@ class _Ending(gymnasium.Wrapper):
         self._steps += 1
         if self._steps > LONGEST_EPISODE:
             raise InputError(
-                f"An episode of {self._task!r} has not ended after {LONGEST_EPISODE:,} steps, and pcil learns between episodes: "
-                "register it with max_episode_steps."
+                f"An episode of {self._task!r} has not ended after {LONGEST_EPISODE:,} steps, and runs need its end: "
+                "register the environment with max_episode_steps."
             )
         return self.env.step(action)
 

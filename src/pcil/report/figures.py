@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 
 from pcil.report import stats
-from pcil.report.load import Dot, Point, curves, label, matrix, read_run
+from pcil.report.load import OFFLINE, Dot, Point, curves, label, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -109,7 +109,8 @@ def grid(
 ) -> str:
     """A panel for each task: mean over seeds of each method with Student's 95% interval, every seed behind it, the expert.
 
-    `value` is the column that is drawn; seeds and expert only for returns. PNG and PDF are written to `path`, SVG is returned.
+    A method that takes no step in the environment is a level line at its last return. `value` is the column that is drawn;
+    seeds and expert only for returns. PNG and PDF are written to `path`, SVG is returned.
     """
     looks = looks or styles(points)
     points = [point for point in points if getattr(point, value) is not None]
@@ -119,7 +120,10 @@ def grid(
         mine = curves(point for point in points if point.task == task)
         shown = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
         for name in (name for name in looks if (task, *name) in mine):
-            _seeds(axis, mine[task, *name], value, looks[name], label(name, looks))
+            if name[0] in OFFLINE:
+                _level(axis, matrix(mine[task, *name], value)[1][:, -1].mean(), looks[name], label(name, looks))
+            else:
+                _seeds(axis, mine[task, *name], value, looks[name], label(name, looks))
         if value == "return_mean":
             experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
             shown += [_expert(axis, expert) for expert in experts if expert is not None]
@@ -131,7 +135,8 @@ def grid(
 def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], Style]) -> str:
     """Share of the expert's return over frames: IQM over all seeds of all tasks of a method, with its bootstrap interval.
 
-    Nothing is drawn, and "" returned, where no task's expert is known.
+    The legend says of how many tasks where methods have not the same number of them. Nothing is drawn, and "" returned, where
+    no task's expert is known.
     """
     strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
     for name, runs in curves(points).items():
@@ -146,8 +151,14 @@ def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], 
         tasks = strata[name]
         frames = np.array(sorted(set.intersection(*(set(own.tolist()) for own, _ in tasks))))
         scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        _line(axis, frames, stats.iqm(*scores), stats.bootstrap(stats.iqm, scores), looks[name], label(name, looks))
-        shown += stats.iqm(*scores).tolist()
+        middle, words = stats.iqm(*scores), label(name, looks)
+        if len({len(tasks) for tasks in strata.values()}) > 1:
+            words += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
+        if name[0] in OFFLINE:
+            _level(axis, middle[-1], looks[name], words)
+        else:
+            _line(axis, frames, middle, stats.bootstrap(stats.iqm, scores), looks[name], words)
+        shown += middle.tolist()
     _expert(axis, 1.0)
     _finish(axis, _span("task", strata), "share of expert (IQM)", shown)
     return save(figure, path)
@@ -160,7 +171,9 @@ def clouds(dots: Sequence[Dot], path: Path, columns: int | None = None) -> str:
     figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
     for axis, name in zip(axes, ((*task, *method) for method in methods for task in tasks), strict=True):
         if name in first:
-            _cloud(axis, first[name])
+            shown = [dot for other, own in first.items() if other[0] == name[0] for dot in own]
+            rewards = [dot.reward for dot in shown if dot.reward is not None]
+            _cloud(axis, first[name], (min(rewards), max(rewards)))
         else:
             axis.axis("off")
     return save(figure, path)
@@ -207,6 +220,12 @@ def _seeds(axis: Axes, runs: Sequence[Sequence[Point]], value: str, style: Style
         _line(axis, frames, np.array([interval.value for interval in middle]), ends, style, name)
 
 
+def _level(axis: Axes, value: float, style: Style, label: str) -> None:
+    """A method that takes no step in the environment: one number, whatever the frames."""
+    look = {"color": style.colour, "linestyle": (0, style.dashes) if style.dashes else "-", "marker": style.marker}
+    axis.axhline(value, linewidth=1.8, markersize=5, label=label, **look)
+
+
 def _line(
     axis: Axes, frames: np.ndarray, middle: np.ndarray, ends: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
 ) -> None:
@@ -219,15 +238,17 @@ def _line(
     axis.plot(frames, middle, linewidth=1.8, label=label, **look)
 
 
-def _cloud(axis: Axes, dots: Sequence[Dot]) -> None:
-    """The agent's transitions coloured by reward, the expert's above them in blue."""
+def _cloud(axis: Axes, dots: Sequence[Dot], ends: tuple[float, float]) -> None:
+    """The agent's transitions coloured by reward, the expert's above them in blue; `ends` are those of the colours, which all
+    methods share on a task."""
     expert, agent = ([dot for dot in dots if (dot.reward is None) == own] for own in (True, False))
     shared = {"s": 12, "linewidths": 0, "rasterized": True}
     rewards = np.array([dot.reward for dot in agent], np.float64)
-    seen = axis.scatter([dot.x for dot in agent], [dot.y for dot in agent], c=rewards, cmap=REWARD_COLOURS, **shared)
+    shared |= {"cmap": REWARD_COLOURS, "vmin": ends[0], "vmax": ends[1]}
+    seen = axis.scatter([dot.x for dot in agent], [dot.y for dot in agent], c=rewards, **shared)
     look = {"color": BLUE, "markersize": 3.5, "markeredgewidth": 0, "linestyle": "", "rasterized": True}
     axis.plot([dot.x for dot in expert], [dot.y for dot in expert], marker="^", label="expert", **look)
-    bar = axis.figure.colorbar(seen, ax=axis, label="true reward of the agent", shrink=0.8)
+    bar = axis.figure.colorbar(seen, ax=axis, label="true reward of an agent step", shrink=0.8)
     assert bar.solids is not None
     bar.solids.set_rasterized(True)
     axis.set(xticks=[], yticks=[])

@@ -14,6 +14,8 @@ import numpy as np
 
 from pcil.errors import InputError
 
+OFFLINE = ("bc",)
+"""Methods that take no step in the environment; their frames only count updates, two frames each where actions are repeated."""
 NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds")
 """Settings by which two runs may differ and still be seeds, or tasks, of one variant."""
 
@@ -37,7 +39,8 @@ class Point(NamedTuple):
     seconds: float | None = None
     """Wall-clock time of the run until then."""
     correlation: float | None = None
-    """Of learned and true reward within an episode: mean over the training episodes since the evaluation before."""
+    """Of learned and true reward within an episode: mean over the training episodes since the evaluation before in which both
+    vary; None where there are none."""
 
 
 class Dot(NamedTuple):
@@ -89,10 +92,14 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
     """
     points, dots, sources, notes = found = Collection([], [], {}, [])
     folders: dict[Path, Path] = {}
+    shown: dict[tuple[Any, ...], Path] = {}
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; give run folders, folders that hold some, or files like results/*.csv.")
         rows = read_points(path) if path.is_file() else []
+        others = {shown.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
+        notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
+        rows = [row for row in rows if shown[type(row), *row[:4]] == path]
         points += (row for row in rows if isinstance(row, Point))
         dots += (row for row in rows if isinstance(row, Dot))
         folders |= {file.parent.resolve(): file.parent for file in sorted(path.rglob("run.json"))}
@@ -104,8 +111,10 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
         except InputError as error:
             notes.append(str(error))
     for (rows, source), variant in zip(runs, _variants([source.settings for _, source in runs]), strict=True):
-        first = sources.setdefault((*rows[0][:2], variant, rows[0].seed), source)
+        name = (*rows[0][:2], variant, rows[0].seed)
+        first = sources.setdefault(name, source)
         if first is source:
+            points[:] = [point for point in points if point[:4] != name]
             points += (row._replace(variant=variant) for row in rows)
         else:
             notes.append(f"{source.folder} holds the same run as {first.folder}, which is shown.")
@@ -130,8 +139,9 @@ def curves(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[list[Row]]]:
 
 
 def label(name: tuple[str, str], names: Iterable[tuple[str, str]]) -> str:
-    """A method, and its variant where the names have several of it."""
-    return name[0] if [method for method, _ in names].count(name[0]) == 1 else ", ".join(name)
+    """A method, and its variant unless that is the default preset's and the only one of the method."""
+    alone = [method for method, _ in names].count(name[0]) == 1
+    return name[0] if alone and name[1] == "default" else ", ".join(name)
 
 
 def matrix(runs: Sequence[Sequence[Point]], value: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
@@ -155,6 +165,7 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
             now = columns["frames"] == frames
             mean, low, high = (round(float(f(columns["return"][now])), 2) for f in (np.mean, np.min, np.max))
             fresh = [episode["correlation"] for episode in episodes if before < episode["frames"] <= frames]
+            fresh = [correlation for correlation in fresh if correlation]  # null, or 0 in older logs, where one does not vary
             returns = {"return_mean": mean, "return_low": low, "return_high": high}
             seconds, health = float(columns["seconds"][now][0]), round(float(np.mean(fresh)), 4) if fresh else None
             points.append(Point(**head, frames=int(frames), **returns, **tail, seconds=seconds, correlation=health))

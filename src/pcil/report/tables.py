@@ -13,7 +13,7 @@ import numpy as np
 
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import Collection, Point, curves, label, matrix
+from pcil.report.load import OFFLINE, Collection, Point, curves, label, matrix
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -56,12 +56,18 @@ def finals(found: Collection) -> Table:
 def overview(found: Collection) -> Table:
     """Returns at a glance: the mean over seeds that the next tables explain, for each task, the demonstrations' beside it.
 
-    A blank was not run. The longer of the two axes goes down.
+    A blank was not run, and a method that has fewer frames of a task than another says how many. The longer of the two axes
+    goes down.
     """
-    means, experts = {}, {}
+    means, experts, lengths = {}, {}, {}
     for (task, *name), runs in curves(found.points).items():
-        means[task, tuple(name)] = stats.mean_interval(_final(runs)[1])
+        frames, final = _final(runs)
+        means[task, tuple(name)] = stats.mean_interval(final)
+        lengths[task, tuple(name)] = 0 if name[0] in OFFLINE else frames
         experts[task] = experts.get(task) or runs[0][-1].expert_return
+    for (task, name), frames in lengths.items():
+        if 0 < frames < max(other for (where, _), other in lengths.items() if where == task):
+            means[task, name] = f"{cell(means[task, name])} at {frames:,}"
     names = list(dict.fromkeys(name for _, name in sorted(means, key=lambda key: key[1][0] != "pcil")))
     columns: dict[str, list[Any]] = {"demonstrations": list(experts.values())}
     columns |= {label(name, names): [means.get((task, name)) for task in experts] for name in names}
@@ -90,7 +96,8 @@ def paper(found: Collection) -> Table:
 def aggregate(found: Collection) -> Table:
     """All tasks together: final return as a share of the demonstrations', over all seeds of all tasks of a method.
 
-    The intervals are a bootstrap's that draws seeds within each task. Compare methods only where they have the same tasks.
+    The intervals are a bootstrap's that draws seeds within each task. Compare methods only where they have the same tasks and
+    the same frames.
     """
     rows = []
     for name, tasks in _by_method(found.points, stats.share_of_expert).items():
@@ -104,11 +111,12 @@ def aggregate(found: Collection) -> Table:
 def efficiency(found: Collection) -> Table:
     """Sample efficiency: the first evaluation at which a seed has 50, 80 and 90% of the demonstrations' return.
 
-    How many seeds got there, and the median over all seeds, which is blank where half of them did not. Minutes are wall-clock
-    time since the run began: core-minutes where each run has one core, as in a sweep.
+    How many seeds got there within the frames of the last column, and the median over all seeds, which is blank where half of
+    them did not. Minutes are wall-clock time since the run began: core-minutes where each run has one core to itself, and more
+    where it shared one. Methods that take no step in the environment are left out.
     """
     rows = []
-    for name, runs in curves(found.points).items():
+    for name, runs in curves(point for point in found.points if point.method not in OFFLINE).items():
         row: list[Any] = [*name]
         for reached in ([stats.first_reach(run, share) for run in runs] for share in SHARES):
             frames = np.median([point.frames if point else math.inf for point in reached])
@@ -116,28 +124,33 @@ def efficiency(found: Collection) -> Table:
             row += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
             row.append(sum(point is not None for point in reached))
         if stats.share_of_expert(runs, np.zeros(len(runs))) is not None:
-            rows.append((*row, len(runs)))
+            rows.append((*row, len(runs), _final(runs)[0]))
     words = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
-    return Table((*KEY, *words, "seeds"), rows)
+    return Table((*KEY, *words, "seeds", "frames"), rows)
 
 
 def improvement(found: Collection) -> Table:
     """Probability of improvement: the chance that a run of the first method ends above one of the second.
 
-    On the same task, a tie being half; the mean over the tasks that both have, with a bootstrap interval.
+    On the same task and at the last evaluation that both have (of a method that takes no step in the environment, its last), a
+    tie being half; the mean over the tasks that both have, with a bootstrap interval.
     """
+    groups: dict[Any, dict[str, list[list[Point]]]] = {}
+    for (task, *name), runs in curves(found.points).items():
+        groups.setdefault(tuple(name), {})[task] = runs
     rows = []
-    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points, lambda runs, final: final).items(), 2):
-        if shared := [task for task in x if task in y]:
-            chance = stats.probability_of_improvement([x[task] for task in shared], [y[task] for task in shared])
-            rows.append((*ours, *theirs, chance, len(shared)))
+    for (ours, x), (theirs, y) in itertools.combinations(groups.items(), 2):
+        if pairs := [_at_the_same_frames(x[task], y[task]) for task in x if task in y]:
+            chance = stats.probability_of_improvement(*zip(*pairs, strict=True))
+            rows.append((*ours, *theirs, chance, len(pairs)))
     return Table(("method", "variant", "over method", "over variant", "probability", "tasks"), rows)
 
 
 def health(found: Collection) -> Table:
     """Health of the learned reward: its correlation with the true one over the steps of a training episode.
 
-    Mean over the episodes of each half of the run, with Student's interval over seeds. The task's own reward has 1.
+    Mean over the episodes of each half of the run in which both vary, with Student's interval over seeds. The task's own reward
+    has 1.
     """
     rows = []
     for name, runs in curves(found.points).items():
@@ -210,6 +223,14 @@ def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:
     """The last frames at which every seed was evaluated, and the returns `[seeds]` there."""
     frames, returns = matrix(runs)
     return int(frames[-1]), returns[:, -1]
+
+
+def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.ndarray, np.ndarray]:
+    """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline."""
+    if {x[0][0].method, y[0][0].method} & set(OFFLINE):
+        return _final(x)[1], _final(y)[1]
+    last = _final([*x, *y])[1]
+    return last[: len(x)], last[len(x) :]
 
 
 def _by_method(points: Sequence[Point], score: Callable[..., np.ndarray | None]) -> dict[Any, dict[str, np.ndarray]]:

@@ -56,8 +56,10 @@ def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int) -> No
     if recorded.return_mean < wanted:
         recorded.info["expert"] += f"; below the wanted {wanted}"
     target = demos.SHIPPED / "dmc" / task / "expert-v0"
+    fresh = target.with_name("fresh")
+    recorded.save(fresh, dataset_id=f"dmc/{task}/expert-v0")
     shutil.rmtree(target, ignore_errors=True)
-    recorded.save(target)
+    fresh.rename(target)
     dataclasses.replace(policy, info=policy.info | info).save(POLICIES / task)
     write_points(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")

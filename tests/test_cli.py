@@ -6,6 +6,7 @@ import contextlib
 import html
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ import pcil
 from pcil import arguments, cli, presets
 from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
+from pcil.envs.toy import PointMass
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
@@ -26,6 +28,7 @@ NARROW = """
     --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
 """
 """`small.small_run` in words, so that both share one compilation."""
+reset = PointMass.reset
 
 
 def narrow_run(demos: str, out: str | Path) -> list[str]:
@@ -104,6 +107,7 @@ TRAIN = [
     ("walker_walk --out new --agent.noise.start=high", "--agent.noise.start FLOAT"),
     ("walker_walk --out new --framse 5000", "--framse, 5000; perhaps you meant --frames INT"),
     ("walker_walk --out new --xyz", "Unrecognized options: --xyz"),
+    ("Pendulum-v1 --out new --demos nowhere --replay-steps 200", "has 200 rows, and an episode of Pendulum-v1 may take 201"),
     ("walker_walk --out new --label often", "'often' .*'sampled', 'stored'"),
     ("walker_walk --out new --frames 1000", "1000 frames .* --frames more than 2000"),
     ("walker_walk --out new --frames=-1", "-1 frames"),
@@ -153,6 +157,9 @@ OTHERS = [
     ("report run --out run/run.json/new", "can't be written"),
     ("demos walker_walk", "Unrecognized options: walker_walk"),
     ("bench --preset best", "'best'"),
+    ("bench --seconds nan", "--seconds is nan"),
+    ("report run --out run", "run holds something else than a report"),
+    ("record run --out new --minimum-return nan", "minimum return is nan"),
     ("doctor --json", "Unrecognized options: --json"),
 ]
 
@@ -419,3 +426,49 @@ def test_interrupts_exit_with_130(
     monkeypatch.setitem(cli.COMMANDS, name, interrupt)
     assert cli.main([name]) == 130
     assert said in capsys.readouterr().err
+
+
+def test_whoever_stops_reading_stops_no_training(demos: str, tmp_path: Path) -> None:
+    """As in `pcil train ... | head -1`."""
+    command, pipes = (
+        [sys.executable, "-m", "pcil", *narrow_run(demos, "run")],
+        {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE},
+    )
+    with subprocess.Popen(command, **pipes) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert b"0 frames" in process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b"" and process.wait() == 0
+    assert (tmp_path / "run" / "DONE").exists()
+
+
+@pytest.mark.parametrize("words", [["demos"], ["--help"]])
+def test_a_closed_pipe_is_no_error_worth_words(words: list[str]) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-m", "pcil", *words], stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_a_full_disk_under_standard_output_is_one_sentence() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "pcil", "--version"], stdout=full, stderr=subprocess.PIPE, check=False, text=True
+        )
+    assert done.returncode == 2 and done.stderr == "pcil: standard output can't be read or written (No space left on device).\n"
+
+
+def test_what_an_environment_prints_is_no_part_of_the_json(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PointMass, "reset", lambda self, **options: print("loud") or reset(self, **options))
+    assert cli.main(["evaluate", str(run), "--episodes", "1", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["episodes"] == 1 and "loud" in err
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"final_return": null}'])
+def test_a_damaged_end_is_refused(text: str, run: Path, demos: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "DONE").write_text(text)
+    assert "DONE can't be read" in refused(narrow_run(demos, run), capsys)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from dataclasses import dataclass
+import subprocess
+import sys
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
+import numpy as np
 import pytest
 
 from pcil import presets
 from pcil.agents import DrQV2
 from pcil.config import Run, completed, differences
 from pcil.envs import TASKS
-from pcil.errors import InputError
+from pcil.errors import InputError, check_kinds
 from pcil.rewards import PCIL, REWARDS, TaskReward
 
 EVERY_RUN = sorted(presets.METHOD_SETTINGS)
@@ -222,3 +225,51 @@ def test_what_is_given_whole_keeps_its_settings_under_every_preset() -> None:
     assert presets.make("walker_walk", preset="released", reward=PCIL(batch_size=64)).reward == PCIL(batch_size=64)
     agent = DrQV2(batch_size=512)
     assert presets.make("walker_walk", "pwil", "released", agent=agent).agent == agent
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """One field of each kind that settings have."""
+
+    word: Literal["sampled", "stored"] = "sampled"
+    whole: int = 1
+    number: float = 0.5
+    maybe: int | None = None
+    switch: bool = False
+    text: str = "a"
+    own: TaskReward = field(default_factory=TaskReward)
+    other: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        check_kinds(self)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"word": "store"}, "Kinds.word is 'store'; it must be one of 'sampled', 'stored'"),
+        ({"whole": 1.5}, "Kinds.whole is 1.5; it must be a whole number"),
+        ({"whole": True}, "must be a whole number"),
+        ({"whole": "9"}, "Kinds.whole is '9'; it must be a whole number"),
+        ({"maybe": 2.5}, "must be a whole number or None"),
+        ({"number": "high"}, "Kinds.number is 'high'; it must be a number"),
+        ({"switch": 1}, "must be True or False"),
+        ({"text": 3}, "must be text"),
+        ({"own": "task"}, "must be of class TaskReward"),
+    ],
+)
+def test_a_setting_of_another_kind_is_refused(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        Kinds(**change)
+
+
+def test_numpys_numbers_are_numbers() -> None:
+    Kinds(whole=np.int64(3), number=np.float32(0.5), maybe=np.int32(1))
+    Kinds(number=3, maybe=2, other="what is not known is not judged")
+
+
+def test_no_third_word_is_taken_in_python_either() -> None:
+    """It would fit neither of the two that the loop asks for; in a process of its own, where no test watches over types."""
+    code = "from pcil import presets; presets.make('walker_walk', label='store')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "InputError: Run.label is 'store'; it must be one of 'sampled', 'stored'" in done.stderr

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from pcil.evaluate import Evaluation, evaluate
+from pcil.evaluate import LOCKSTEP, Evaluation, environments_for, evaluate
 from pcil.seeds import Stream, episode_seed
 
 
@@ -107,3 +107,26 @@ def test_a_policy_that_returns_too_few_actions_is_noticed() -> None:
 
 def test_the_mean_is_over_episodes() -> None:
     assert Evaluation(np.array([1.0, 2.0, 6.0]), np.array([1, 1, 1]), 0.5).mean == 3.0
+
+
+def test_fewer_environments_than_episodes_take_them_in_turns() -> None:
+    returns, lengths = one_by_one([Walk(3) for _ in range(7)], seed=4)
+    turns = walks(3, 3)
+    result = evaluate(policy, turns, seed=4, episodes=7)
+    assert (result.returns.tolist(), result.lengths.tolist()) == (returns, lengths)
+    assert [len(env.seeds) for env in turns] == [4, 3]
+    assert len(environments_for("toy/point_mass-v0", 1000)) == LOCKSTEP and len(environments_for("toy/point_mass-v0", 2)) == 2
+
+
+def test_an_environment_may_reuse_its_buffer() -> None:
+    class Reusing(Walk):
+        """Hands out one array again and again."""
+
+        buffer = np.zeros(2, np.float32)
+
+        def observe(self) -> np.ndarray:
+            self.buffer[:] = super().observe()
+            return self.buffer
+
+    plain = evaluate(policy, [Walk(4), Walk(4)], seed=1)
+    assert evaluate(policy, [Reusing(4), Reusing(4)], seed=1).returns.tolist() == plain.returns.tolist()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -412,3 +413,35 @@ def test_pwil_pays_alpha_for_every_step_of_a_copy_of_the_only_demonstration(demo
     (copy,) = runs.demonstrations(run).episodes
     state = loop.start(run, envs.spec(envs.make(run.task)), [copy])
     assert np.allclose(learner.label_episode(run.learner, state.learner, copy, 0), 3)
+
+
+def test_without_a_whole_checkpoint_the_run_begins_again_and_says_so(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "whole")
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "lost", StopAfter(3))
+    shutil.rmtree(tmp_path / "lost" / "checkpoint")
+    listener = StopAfter(-1)
+    runs.execute(run, tmp_path / "lost", listener)
+    assert any("no whole checkpoint" in text and "begins again" in text for text in listener.said)
+    same_run(tmp_path / "whole", tmp_path / "lost")
+
+
+def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> None:
+    """As that of another version would be."""
+    run, folder = small_run(demos=demos), tmp_path / "run"
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, folder, StopAfter(1))
+    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24))
+    about = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(about | {"run": other.to_json()}))
+    before = (folder / "train.jsonl").read_bytes()
+    with pytest.raises(InputError, match=r"of another version of pcil \(learner.agent.*24"):
+        runs.execute(other, folder, runs.Silent())
+    assert (folder / "train.jsonl").read_bytes() == before
+
+
+def test_a_replay_smaller_than_an_episode_is_refused_before_anything_is_written(reused: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has 4 rows, and an episode of pcil_test/reused-v0 may take 5"):
+        runs.execute(small_run("expert", reused, replay_steps=4), tmp_path / "run", runs.Silent())
+    assert not (tmp_path / "run").exists()

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -152,6 +153,8 @@ BAD = [
     (WHOLE.replace("[1]", "[-1]"), "seed is -1"),
     (WHOLE + "cores = 0", "0 cores"),
     (WHOLE + "gpus = -1", "-1 GPUs"),
+    (WHOLE + "gpus = nan", "nan GPUs"),
+    (WHOLE.replace("pendulum_swingup", "--help"), "the task '--help', which looks like an option"),
     (WHOLE + "[settings]\nagent.gama = 0.9", "--agent.gama"),
     (WHOLE + "[settings]\nagent.batch_size = 64.5", "--agent.batch-size INT"),
     (WHOLE + "[settings]\nseed = 3", "'seed' among its settings"),
@@ -237,6 +240,18 @@ def test_where_room_is_short_the_running_runs_are_shown() -> None:
 
 
 # --- On Ray ---
+
+
+def test_a_run_that_ended_where_nobody_sees_it_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a node whose storage is its own."""
+    monkeypatch.setattr(sweep, "VISIBLE_SECONDS", 0.0)
+    ray = SimpleNamespace(get=lambda ref: 0, exceptions=SimpleNamespace(TaskCancelledError=KeyError, RayError=OSError))
+    (job,) = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1]").jobs
+    state, said = sweep._outcome(ray, None, job)
+    assert state == "failed" and "storage that all nodes see" in said
+    job.folder.mkdir(parents=True)
+    (job.folder / "DONE").touch()
+    assert sweep._outcome(ray, None, job)[0] == "done"
 
 
 def test_a_worker_waits_for_the_one_that_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

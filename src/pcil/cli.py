@@ -1,5 +1,7 @@
 """The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
 
+import contextlib
+import errno
 import importlib
 import json
 import os
@@ -20,16 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or words[0] in ("-h", "--help"):
-        print(_overview())
-        return 0
-    if words[0] == "--version":
-        print(f"pcil {importlib.import_module('pcil').__version__}")
-        return 0
     try:
-        if words[0] not in COMMANDS:
-            raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
-        return COMMANDS[words[0]](words[1:])
+        code = _command(words)
+        sys.stdout.flush()
+        return code
     except InputError as error:
         sentence = " ".join(str(error).split())  # what a library said may have line breaks
         print(f"pcil: {sentence.removesuffix('.')}.", file=sys.stderr)
@@ -39,7 +35,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"pcil: stopped{again}.", file=sys.stderr)
         return 130
     except BrokenPipeError:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of the rest at its end
         return 141
+    except OSError as error:
+        if error.filename is None and error.errno != errno.ENOSPC:
+            raise
+        print(f"pcil: {error.filename or 'standard output'} can't be read or written ({error.strerror}).", file=sys.stderr)
+        return 2
+
+
+def _command(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    if words[0] == "--version":
+        print(f"pcil {importlib.import_module('pcil').__version__}")
+        return 0
+    if words[0] not in COMMANDS:
+        raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
+    return COMMANDS[words[0]](words[1:])
 
 
 def _overview() -> str:
@@ -55,13 +70,12 @@ def _train(words: list[str]) -> int:
 
 def _run(run: "Run", out: Path) -> int:
     """Execute with a progress bar; end with a plain statement of how close to the expert it came, and the curve."""
-    from rich.console import Console
-
     from pcil import envs, loop, progress, runs
 
+    out = out.expanduser()
     demos = runs.demonstrations(run)
     expert = demos.return_mean if demos else _shipped_return(envs.task_name(run.task))
-    with progress.Bar(Console(), expert) as bar:
+    with progress.Bar(progress.Screen(), expert) as bar:
         try:
             result = runs.execute(run, out, bar)
         except loop.Stopped:
@@ -111,14 +125,15 @@ def _evaluate(words: list[str]) -> int:
             seed: The episodes' starts follow from it.
             json_output: Print one JSON object and nothing else.
         """
-        from pcil import envs
+        from pcil.evaluate import environments_for
         from pcil.evaluate import evaluate as roll_out
         from pcil.policy import load_policy
 
         _at_least(1, episodes=episodes)
         _at_least(0, seed=seed)
         policy = load_policy(folder)
-        result = roll_out(policy, [envs.make(policy.task) for _ in range(episodes)], seed=seed)
+        with contextlib.redirect_stdout(sys.stderr):  # an environment may print
+            result = roll_out(policy, environments_for(policy.task, episodes), seed=seed, episodes=episodes)
         row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
         row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
         if json_output:
@@ -165,7 +180,7 @@ def _record(words: list[str]) -> int:
             out: The dataset's folder; it must not exist.
             episodes: How many.
             seed: The episodes' starts follow from it.
-            minimum_return: Keep only episodes above this return.
+            minimum_return: Keep only episodes of at least this return.
         """
         from pcil import demos, envs
         from pcil.policy import load_policy
@@ -173,6 +188,7 @@ def _record(words: list[str]) -> int:
 
         _at_least(1, episodes=episodes)
         _at_least(0, seed=seed)
+        demos.free_folder(out)
         policy = load_policy(folder)
         info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed} --out {out}")
         recorded = demos.record(
@@ -246,12 +262,10 @@ def _sweep(words: list[str]) -> int:
             jobs: Runs at the same time; by default as many as there are cores for.
             address: A Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine, and stopped at the end.
         """
-        from rich.console import Console
-
-        from pcil import sweep
+        from pcil import progress, sweep
 
         _at_least(1, jobs=1 if jobs is None else jobs)
-        return sweep.sweep(file, out, jobs, address, Console(file=sys.stdout))
+        return sweep.sweep(file, out.expanduser(), jobs, address, progress.Screen(file=sys.stdout))
 
     return arguments.call("sweep", sweep, words)
 
@@ -277,6 +291,8 @@ def _bench(words: list[str]) -> int:
         """
         from pcil import bench
 
+        if not 0 < seconds < 86_400:
+            raise InputError(f"--seconds is {seconds}; it must be above 0 and below a day.")
         figures = bench.measure(task, preset, seconds)
         print(json.dumps(figures) if json_output else bench.table(figures))
         return 0

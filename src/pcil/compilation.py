@@ -8,19 +8,19 @@ from pathlib import Path
 
 def cache_folder() -> Path:
     """`JAX_COMPILATION_CACHE_DIR` where it is set, else `pcil/jax` in the user's cache folder."""
-    given = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(given) if given else Path(home) / "pcil" / "jax"
+    if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return Path(given)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pcil" / "jax"
 
 
 def use_cache() -> None:
     """Turn the cache on for this process; where the folder can't be written, compile without it."""
     import jax
 
-    folder = cache_folder()
     try:
+        folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # a user without a home raises the latter
         return
     if os.access(folder, os.W_OK):
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pcil.agents import Agent, DrQV2
-from pcil.errors import InputError, check_ranges
+from pcil.errors import InputError, check_kinds, check_ranges
 from pcil.rewards import PCIL, Reward
 
 MACHINE_SETTINGS = ("checkpoint_seconds",)
@@ -67,6 +67,7 @@ class Run:
     """Least time from one checkpoint to the next; a checkpoint is written between episodes, and when the run stops."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         if self.label == "sampled" and self.reward.scope == "episode":
             raise InputError(
                 f"{type(self.reward).__name__} needs whole episodes in order and can't label sampled steps; use --label stored."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 import re
 import tempfile
@@ -112,13 +113,11 @@ class Demonstrations:
         Gymnasium has it registered. `InputError` if something is there already or the place can not be written.
         """
         self.validate(None)
-        folder = Path(path).expanduser().resolve()
+        folder = free_folder(path)
         dataset_id = dataset_id or _dataset_id(folder)
         if not re.fullmatch(r"([-\w]+/)*[-\w]+-v\d+", dataset_id):
             raise InputError(f"{dataset_id!r} is no Minari dataset id: it must look like namespace/name-v0.")
         try:
-            if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-                raise InputError(f"{folder} exists already: give a path where there is nothing yet.")
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
                 unfinished = Path(scratch) / "dataset"
@@ -157,6 +156,17 @@ class Demonstrations:
             storage.update_episodes([buffer])
 
 
+def free_folder(path: str | Path) -> Path:
+    """The absolute path of a folder that is still to be made, or is empty; `InputError` where something is there."""
+    folder = _expanded(Path(path)).resolve()
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder} exists already: give a path where there is nothing yet.")
+    except OSError as error:
+        raise InputError(f"{folder} can not be written ({reason(error)}): the place must be writable.") from error
+    return folder
+
+
 def record(
     policy: Callable[[np.ndarray], Any],
     env: gymnasium.Env,
@@ -174,6 +184,8 @@ def record(
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for, but at least 1 must be recorded.")
+    if minimum_return is not None and not minimum_return < math.inf:
+        raise InputError(f"The minimum return is {minimum_return}; it must be a number that an episode can reach.")
     kept: list[Episode] = []
     for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
         episode = _rollout(policy, env, seeds.episode_seed(seed, seeds.Stream.RECORD, attempt))
@@ -238,9 +250,11 @@ def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -
 
 def _find(spec: str | Path) -> Path:
     """The folder with the `metadata.json` of the dataset that `spec` names."""
-    names, places = shipped_tasks(), [Path(spec).expanduser(), _minari_root() / spec]
+    names = shipped_tasks()
     if isinstance(spec, str) and task_of(spec) in names:
         places = [SHIPPED / "dmc" / task_of(spec) / "expert-v0"]
+    else:
+        places = [_expanded(Path(spec)), _minari_root() / spec]
     for place in places:
         for data in (place / "data", place):
             if (data / "metadata.json").is_file():
@@ -265,7 +279,15 @@ def _env_spec(task: str) -> EnvSpec | None:
 
 def _minari_root() -> Path:
     """Where Minari looks for datasets; unlike Minari's own function, this does not make the folder."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")).expanduser()
+    return _expanded(Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")))
+
+
+def _expanded(path: Path) -> Path:
+    """A path with "~" put in, as it is where nobody knows whose home is meant."""
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        return path
 
 
 def _dataset_id(folder: Path) -> str:

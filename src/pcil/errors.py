@@ -1,8 +1,12 @@
-"""The one error that is a person's to mend, and the check of settings that raises it."""
+"""The one error that is a person's to mend, and the checks of settings that raise it."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import numbers
+import types
+import typing
 from typing import Any
 
 
@@ -17,3 +21,32 @@ def check_ranges(settings: Any, **ranges: tuple[float | int, float | int]) -> No
         if not low <= value <= high:  # NaN is in no range
             limits = f"at least {low}" if math.isinf(high) else f"from {low} to {high}"
             raise InputError(f"{type(settings).__name__}.{name} is {value}; it must be {limits}.")
+
+
+def check_kinds(settings: Any) -> None:
+    """Each field must be what its annotation says: one of some words, a number, text, a class; `InputError` if it is not."""
+    hints = typing.get_type_hints(type(settings))
+    for field in dataclasses.fields(settings):
+        value, hint = getattr(settings, field.name), hints[field.name]
+        if not _fits(value, hint):
+            raise InputError(f"{type(settings).__name__}.{field.name} is {value!r}; it must be {_described(hint)}.")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a kind; of an annotation that says more than is known here, every value is."""
+    if typing.get_origin(hint) is typing.Literal:
+        return value in typing.get_args(hint)
+    if isinstance(hint, types.UnionType):
+        return any(_fits(value, part) for part in typing.get_args(hint))
+    if hint in (int, float):
+        return isinstance(value, numbers.Integral if hint is int else numbers.Real) and not isinstance(value, bool)
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _described(hint: Any) -> str:
+    if typing.get_origin(hint) is typing.Literal:
+        return f"one of {', '.join(map(repr, typing.get_args(hint)))}"
+    if isinstance(hint, types.UnionType):
+        return " or ".join(map(_described, typing.get_args(hint)))
+    words = {int: "a whole number", float: "a number", str: "text", bool: "True or False", types.NoneType: "None"}
+    return words.get(hint) or f"of class {hint.__name__}"

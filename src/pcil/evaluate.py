@@ -9,7 +9,11 @@ from dataclasses import dataclass
 import gymnasium
 import numpy as np
 
+from pcil import envs
 from pcil.seeds import Stream, episode_seed
+
+LOCKSTEP = 32
+"""Episodes that are played at once, at most."""
 
 
 @dataclass(frozen=True)
@@ -29,22 +33,37 @@ class Evaluation:
         return float(np.mean(self.returns))
 
 
-def evaluate(act: Callable[[np.ndarray], np.ndarray], environments: Sequence[gymnasium.Env], *, seed: int) -> Evaluation:
-    """One episode in each of `environments`; `act` maps observations `[k, obs]` of those still running to `[k, action]`.
+def environments_for(task: str, episodes: int) -> list[gymnasium.Env]:
+    """What `evaluate` plays so many episodes in: one each, but not more than `LOCKSTEP`, for each takes memory."""
+    return [envs.make(task) for _ in range(min(episodes, LOCKSTEP))]
+
+
+def evaluate(
+    act: Callable[[np.ndarray], np.ndarray],
+    environments: Sequence[gymnasium.Env],
+    *,
+    seed: int,
+    episodes: int | None = None,
+) -> Evaluation:
+    """So many episodes, by default one in each of `environments`, as many at once as there are of these.
+
+    `act` maps observations `[k, obs]` of those still running to `[k, action]`.
 
     Episode `i` starts from a seed that depends on `seed` and `i` alone, so every evaluation of a run meets the same starts.
     """
     begin = time.perf_counter()
-    num = len(environments)
-    returns, lengths = np.zeros(num), np.zeros(num, np.int64)
-    obs = np.stack([env.reset(seed=episode_seed(seed, Stream.EVALUATE, i))[0] for i, env in enumerate(environments)])
-    running = np.arange(num)
-    while len(running):
-        over = np.zeros(len(running), bool)
-        for k, (i, action) in enumerate(zip(running.tolist(), act(obs[running]), strict=True)):
-            obs[i], reward, terminated, truncated, _ = environments[i].step(action)
-            returns[i] += float(reward)
-            lengths[i] += 1
-            over[k] = terminated or truncated
-        running = running[~over]
+    episodes = len(environments) if episodes is None else episodes
+    returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
+    for first in range(0, episodes, len(environments)):
+        block = dict(zip(range(first, episodes), environments, strict=False))
+        seeds = {i: episode_seed(seed, Stream.EVALUATE, i) for i in block}
+        obs = {i: np.array(env.reset(seed=seeds[i])[0], np.float32) for i, env in block.items()}
+        while obs:
+            for i, action in zip(list(obs), act(np.stack([*obs.values()])), strict=True):
+                new, reward, terminated, truncated, _ = block[i].step(action)
+                returns[i] += float(reward)
+                lengths[i] += 1
+                obs[i] = np.array(new, np.float32)
+                if terminated or truncated:
+                    del obs[i]
     return Evaluation(returns, lengths, time.perf_counter() - begin)

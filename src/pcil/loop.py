@@ -17,7 +17,7 @@ import numpy as np
 from pcil import checkpoint, envs, learner, seeds
 from pcil.config import Run
 from pcil.errors import InputError
-from pcil.evaluate import Evaluation, evaluate
+from pcil.evaluate import Evaluation, environments_for, evaluate
 from pcil.learner import Learner
 from pcil.metrics import MetricWriter, pearson
 from pcil.networks import Actor
@@ -82,7 +82,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
     """
     env = envs.make(run.task)
     spec = envs.spec(env)
-    rollout = [envs.make(run.task) for _ in range(run.evaluate_episodes)]
+    rollout = environments_for(run.task, run.evaluate_episodes)
     state, positions = resume(run, folder, start(run, spec, demos), reporter)
     clock = _Clock(state.counters.seconds)
     saved = clock.total()
@@ -230,7 +230,7 @@ def _evaluate(
 ) -> Evaluation:
     """Roll out the mean action, write `eval.csv`, and leave the policy of this moment in the folder."""
     host = on_host(state.actor)
-    result = evaluate(lambda obs: host(obs, np), rollout, seed=run.seed)
+    result = evaluate(lambda obs: host(obs, np), rollout, seed=run.seed, episodes=run.evaluate_episodes)
     log.evaluation(state.counters.frames, clock.total(), result)
     state.counters = replace(state.counters, evaluations=state.counters.evaluations + 1)
     info = {
@@ -259,7 +259,7 @@ def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     for episode in itertools.cycle(played):
         if left <= 0:
             break
-        replay.add(episode, np.float32(reward + run.reward.task_weight * episode.reward))
+        replay.add(episode, np.asarray(reward + run.reward.task_weight * episode.reward, np.float32))
         left -= len(episode)
     actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
@@ -282,16 +282,22 @@ def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[St
     for complaint in complaints:
         reporter.say(complaint)
     if arrays is None:
+        if (folder / "train.jsonl").exists():
+            reporter.say(f"There is no whole checkpoint in {folder}, so the run begins again.")
         return fresh, {}
-    restored = checkpoint.unflatten("learner", fresh.learner, arrays)
-    counters = Counters(**meta["counters"])
+    try:
+        restored = checkpoint.unflatten("learner", fresh.learner, arrays)
+        actor = checkpoint.unflatten("actor", fresh.actor, arrays)
+        counters = Counters(**meta["counters"])
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"The checkpoint in {folder} is of another version of pcil ({error}); go on with that one, or give another --out."
+        ) from error
     if counters.final_return is None:
         if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
             fresh.replay.load(held)
         reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    return State(restored, checkpoint.unflatten("actor", fresh.actor, arrays), fresh.replay, fresh.expert, counters), meta[
-        "positions"
-    ]
+    return State(restored, actor, fresh.replay, fresh.expert, counters), meta["positions"]
 
 
 class _Clock:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import os
 import re
 import tomllib
@@ -79,7 +80,7 @@ def read(file: Path, out: Path) -> Plan:
         raise InputError(f"{file} can't be read as TOML ({error}).") from error
     _check(str(file), table, FILE)
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))
-    if plan.cores < 1 or plan.gpus < 0:
+    if plan.cores < 1 or not 0 <= plan.gpus < math.inf:
         raise InputError(f"{file} gives a run {plan.cores} cores and {plan.gpus} GPUs; it needs at least 1 core and 0 GPUs.")
     for where, product in _products(str(file), table):
         for name, words in _combinations(where, product):
@@ -121,6 +122,8 @@ def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, li
     base = {key: product[key] for key in ("preset", "frames") if key in product} | _flat(product.get("settings", {}))
     for variant, changes in (product.get("variants") or {"": {}}).items():
         settings = base | _flat(changes)
+        if dashed := [task for task in product.get("tasks", []) if task.startswith("-")]:
+            raise InputError(f"{where} has the task {dashed[0]!r}, which looks like an option.")
         for key in {"task", "seed", "out", "help"} & settings.keys():
             raise InputError(f"{where} has {key!r} among its settings; there are the lists tasks and seeds, and --out.")
         own = settings.get("reward", settings.get("method"))

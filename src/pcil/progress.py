@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from datetime import timedelta
@@ -36,15 +39,36 @@ def compared(value: float, expert: float) -> str:
     return f"{share}the expert's {expert:.1f}"
 
 
+class Screen(Console):
+    """A console that falls silent, and stops nothing, once nobody reads it any more: a pipe was closed, a terminal lost."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of it at the end
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        try:
+            super().print(*objects, **options)
+        except OSError:
+            self.on_broken_pipe()
+
+
 class Signals:
-    """While it is entered, the first Ctrl-C or SIGTERM is kept and answered; a second Ctrl-C stops at once."""
+    """While it is entered, the first Ctrl-C, SIGTERM or SIGHUP is kept and answered; a second Ctrl-C stops at once.
+
+    A SIGHUP that is ignored, as under nohup, stays ignored.
+    """
 
     def __init__(self, answer: Callable[[], None]) -> None:
         self.number: int | None = None
         self._answer = answer
 
     def __enter__(self) -> Signals:
-        self._before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = {signal.SIGINT, signal.SIGTERM}
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+            numbers.add(signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._ask) for number in numbers}
         return self
 
     def __exit__(self, *exception: object) -> None:

@@ -62,6 +62,11 @@ class Replay:
         """Whole episodes held."""
         return len(self._segments)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the rows when the ring is full, in bytes."""
+        return self._obs.nbytes + self._action.nbytes + self._reward.nbytes
+
     def num_windows(self, n: int) -> int:
         """How many windows of `n` steps may be drawn."""
         _, cumulative = self._starts(n)
@@ -72,7 +77,7 @@ class Replay:
         rows = len(episode) + 1
         if rows > self.capacity:
             raise InputError(
-                f"An episode of {len(episode)} steps does not fit into a replay of {self.capacity} rows; enlarge the replay."
+                f"An episode of {len(episode)} steps does not fit into a replay of {self.capacity} rows; enlarge it."
             )
         while self._segments and self._free() < rows:
             self._segments.popleft()

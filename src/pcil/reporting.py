@@ -27,11 +27,8 @@ def report(
         from pcil.report import load, page
     except ImportError as error:
         raise InputError(f"A report needs {error.name}, which pip install '.[report]' in a clone brings.") from error
-    found = load.collect(paths, _completed)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
+    found = load.collect([path.expanduser() for path in paths], _completed)
+    page.clear(out := out.expanduser())
     films: dict[str, bytes] = {}
     if rollouts and found.sources:
         from pcil import film, representation

@@ -48,10 +48,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
         return []
     demos, env = runs.demonstrations(run), envs.make(run.task)
     assert demos is not None
-    try:
-        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
-    except ValueError as error:
-        raise InputError(f"the checkpoint of {source.folder} is of another version ({error}).") from error
+    state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
     if not state.counters.episodes:
         raise InputError(f"{source.folder} holds no checkpoint that can be read.")
     rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
@@ -71,7 +68,7 @@ def completed(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
     try:
         return flat(_made(settings).plain.to_json()) | settings
-    except (InputError, TypeError):
+    except (InputError, TypeError, AttributeError):
         return settings
 
 

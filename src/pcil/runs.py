@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Iterator
@@ -77,8 +78,8 @@ def train(
 def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
     compilation.use_cache()
-    demos = demonstrations(run)
-    with _claimed(folder), _full_disk_is_input_error(folder):
+    folder, demos = folder.expanduser(), demonstrations(run)
+    with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
             final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter).counters.final_return
@@ -88,12 +89,22 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
 
 def read_done(folder: Path) -> float:
     """The final return of a finished run: the mean of its last evaluation."""
-    return json.loads((folder / "DONE").read_text())["final_return"]
+    try:
+        return float(json.loads((folder / "DONE").read_text())["final_return"])
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{folder / 'DONE'} can't be read ({type(error).__name__}: {error}); delete it, and the same command ends the run."
+        ) from error
 
 
 def demonstrations(run: Run) -> Demonstrations | None:
     """What the run imitates, checked against its environment, or None where it needs no demonstrations."""
     environment = envs.make(run.task)
+    limit = environment.spec and environment.spec.max_episode_steps
+    if limit and limit >= run.replay_steps:
+        raise InputError(
+            f"The replay has {run.replay_steps} rows, and an episode of {run.task} may take {limit + 1}; enlarge it."
+        )
     if not run.reward.needs_demos and not run.agent.offline:
         return None
     source = run.task if run.demos is None else run.demos
@@ -158,7 +169,7 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
         before = json.loads((folder / "run.json").read_text())
         changed = differences(completed(before["run"], run.plain.to_json()), identity["run"])
         changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder."
         ) from error
@@ -201,16 +212,21 @@ def provenance(folder: Path, policy: Policy, command: str) -> dict[str, Any]:
 
 
 def _write(path: Path, text: str) -> None:
-    """The whole file or nothing."""
+    """The whole file or nothing, after a power cut too."""
     partial = path.with_suffix(path.suffix + ".tmp")
-    partial.write_text(text)
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(path)
 
 
 @contextlib.contextmanager
-def _full_disk_is_input_error(folder: Path) -> Iterator[None]:
+def _no_room_is_input_error(folder: Path) -> Iterator[None]:
     try:
         yield
+    except MemoryError as error:
+        raise InputError(f"There is not enough memory ({error}); make --replay-steps smaller.") from error
     except (OSError, ValueError) as error:
         full = getattr(error, "errno", None) == errno.ENOSPC or "No space left on device" in str(error)
         if not full:

@@ -34,6 +34,9 @@ RETRIES = 8
 PATIENCE_SECONDS = 60.0
 """How long it then waits for the old worker to let go of the folder: on a node that is cut off it lives a little longer."""
 
+VISIBLE_SECONDS = 15.0
+"""How long a finished run's DONE is waited for."""
+
 
 def sweep(file: Path, out: Path, limit: int | None, address: str | None, console: Console) -> int:
     """Finish every run of a file, at most `limit` at a time; 1 where some failed, 130 or 143 where a signal stopped them."""
@@ -163,10 +166,20 @@ def _outcome(ray: Any, ref: Any, job: Job) -> tuple[str, str]:
         code, death = 1, [str(error).strip().splitlines()[0]]
     if code in (130, 143):
         return "waiting", f"stopped {job.name} at {job.frames:,} frames"
+    if code == 0 and not _appears(job.folder / "DONE"):
+        code, death = 1, [f"It ended well, but {job.folder} has no DONE here: give --out a path on storage that all nodes see."]
     if code == 0:
         return "done", f"done    {job.name}: return {job.last_return:.1f}"
     end = job.log.read_text(errors="replace").splitlines()[-12:] if job.log.exists() else []
     return "failed", "\n    ".join([f"failed  {job.name}; the end of {job.log}:", *end, *death])
+
+
+def _appears(file: Path) -> bool:
+    """Whether a file that another node may have written is there; shared storage can take some seconds to show it."""
+    until = time.monotonic() + VISIBLE_SECONDS
+    while not file.exists() and time.monotonic() < until:
+        time.sleep(0.5)
+    return file.exists()
 
 
 def picture(jobs: list[Job], speed: float, room: int) -> Group:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -161,6 +163,19 @@ def test_unknown_names_list_what_there_is(name: str) -> None:
 def test_near_misses_are_recognised(name: str, meant: str) -> None:
     with pytest.raises(InputError, match=f"did you mean '{meant}'"):
         make(name)
+
+
+def test_an_environment_of_ones_own_lies_in_the_present_folder_or_is_refused_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    text = "import gymnasium\ngymnasium.register('pcil_test/Own-v0', 'gymnasium.envs.classic_control:PendulumEnv')\n"
+    Path("my_own_module.py").write_text(text)
+    Path("my_bad_module.py").write_text("raise ValueError('boom')\n")
+    assert spec(make("my_own_module:pcil_test/Own-v0")).obs_dim == 3
+    del gymnasium.registry["pcil_test/Own-v0"]
+    with pytest.raises(InputError, match=r"can't be made \(ValueError: boom\)"):
+        make("my_bad_module:pcil_test/Own-v0")
 
 
 def test_a_missing_package_is_named(register_env: Any) -> None:

@@ -205,3 +205,17 @@ def test_a_label_says_the_variant_unless_it_is_the_default_presets_alone() -> No
 
 def test_nested_settings_are_flat_by_their_dotted_names() -> None:
     assert flat({"a": 1, "b": {"c": {"d": None}, "e": "x"}}) == {"a": 1, "b.c.d": None, "b.e": "x"}
+
+
+def test_without_rows_a_file_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("old")
+    with pytest.raises(InputError, match="no rows"):
+        write_points(tmp_path / "x.csv", [])
+    assert (tmp_path / "x.csv").read_text() == "old"
+
+
+def test_seeds_without_frames_in_common_are_not_averaged(tmp_path: Path) -> None:
+    fake_run(tmp_path / "a", {1000: 5}, seed=1)
+    fake_run(tmp_path / "b", {2000: 6}, seed=2)
+    found = collect([tmp_path])
+    assert {point.seed for point in found.points} == {1} and "no frames in common; only seed 1" in found.notes[0]

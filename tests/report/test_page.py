@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from fake_runs import fake_run, fake_sweep
+from pcil.errors import InputError
 from pcil.report import load, page
 from pcil.report.load import Collection, Dot
 
@@ -177,3 +178,20 @@ def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
         picture.click()
         assert picture.bounding_box()["width"] == before["width"]
         browser.close()
+
+
+def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
+    """What an earlier one drew of other runs goes; a page that is not ours stays, and so does a file of somebody else's."""
+    out = tmp_path / "out"
+    for task in ("walker_run", "hopper_hop"):
+        fake_run(tmp_path / task, [1.0, 2.0], task)
+        page.clear(out)
+        page.build(load.collect([tmp_path / task]), out, {})
+        (out / "figures" / "mine.txt").write_text("mine")
+    names = {path.name for path in (out / "figures").iterdir()}
+    assert "mine.txt" in names and "curves-hopper_hop.png" in names and not any("walker_run" in name for name in names)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text("<title>mine</title>")
+    with pytest.raises(InputError, match="something else than a report"):
+        page.clear(tmp_path / "site")
+    assert (tmp_path / "site" / "index.html").read_text() == "<title>mine</title>"

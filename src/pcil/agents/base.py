@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pcil.errors import check_ranges
+from pcil.errors import check_kinds, check_ranges
 from pcil.networks import Actor, Trunk
 from pcil.types import Spec, Window
 
@@ -37,6 +37,7 @@ class Agent(abc.ABC):
     """Let a termination lead into an absorbing state, which observations mark by a further entry; no end is free then."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         check_ranges(self, batch_size=(1, inf), n_step=(1, inf))
 
     @abc.abstractmethod

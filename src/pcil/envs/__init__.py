@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import sys
 import warnings
 from typing import Any, NoReturn
 
@@ -78,6 +79,8 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
     if render_mode is not None and env_id in _TOYS:
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
     render: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+    if ":" in env_id:
+        sys.path.insert(0, "")  # the module may lie in the present folder
     try:
         env = gymnasium.make(env_id, disable_env_checker=True, **render)
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
@@ -86,6 +89,8 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
         if env_id.rpartition(":")[2] not in gymnasium.registry:
             _refuse_name(task, error)
         raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
+    except Exception as error:  # the environment may be a person's own and may raise anything
+        raise InputError(f"The environment {task!r} can't be made ({type(error).__name__}: {error}).") from error
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
         env = _flat_actions(_flat_observations(env, task), task)

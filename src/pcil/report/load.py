@@ -122,6 +122,11 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
         where = ", ".join(map(str, paths)) or "nothing"
         raise InputError([*notes, f"There is no run in {where}; give folders that pcil train made."][0])
     dots.sort(key=place)
+    for name, seeds in curves(points).items():
+        if not len(matrix(seeds)[0]):
+            first = seeds[0][0].seed
+            notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {first} is shown.")
+            points[:] = [point for point in points if point[:3] != name or point.seed == first]
     return found._replace(points=list({point[:5]: point for point in sorted(points, key=place)}.values()))
 
 
@@ -194,12 +199,16 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def write_points(path: Path, rows: Sequence[Point] | Sequence[Dot]) -> None:
-    """One header and a row a point or a dot."""
+    """One header and a row a point or a dot; the whole file or, without rows, nothing and `InputError`."""
+    if not rows:
+        raise InputError(f"There are no rows to write to {path}; it stays as it is.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
+    partial = path.with_name(f"{path.name}.tmp")
+    with partial.open("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(rows[0]._fields)
         table.writerows(rows)
+    partial.replace(path)
 
 
 def read_points(path: Path) -> list[Any]:
@@ -210,7 +219,7 @@ def read_points(path: Path) -> list[Any]:
         kind = Dot if table and "silhouette" in table[0] else Point
         parse = {name: _PARSERS[hint] for name, hint in get_type_hints(kind).items()}
         return [kind(**{name: parse[name](value) for name, value in row.items()}) for row in table]
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, csv.Error) as error:
         raise InputError(f"{path} is no file of results ({error}); give one like those in results/.") from error
 
 

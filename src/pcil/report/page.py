@@ -9,8 +9,27 @@ from pathlib import Path
 
 from jinja2 import Environment
 
+from pcil.errors import InputError
 from pcil.report import figures, tables
 from pcil.report.load import Collection, write_points
+
+TITLE = "<title>pcil report"
+"""By which a page is known as ours."""
+
+
+def clear(out: Path) -> None:
+    """Make the folder `out`, or take away what an earlier report left there; `InputError` where something else is in it."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        old = out / "index.html"
+        if any(out.iterdir()) and not (old.is_file() and TITLE in old.read_text(errors="replace")[:1000]):
+            raise InputError(f"{out} holds something else than a report; give --out a new or empty folder.")
+        for folder, kinds in (("figures", (".png", ".pdf")), ("tables", (".csv", ".md"))):
+            for file in (out / folder).glob("*"):
+                if file.suffix in kinds:
+                    file.unlink()
+    except OSError as error:
+        raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
 
 
 def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from pcil.errors import check_ranges
+from pcil.errors import check_kinds, check_ranges
 from pcil.types import Batch, Window
 
 Metrics = dict[str, Float[Array, ""]]
@@ -57,6 +57,7 @@ class Reward(abc.ABC):
     """Expert steps in one update, and as many of the agent."""
 
     def __post_init__(self) -> None:
+        check_kinds(self)
         check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf))
 
     @property

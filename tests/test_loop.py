@@ -436,7 +436,7 @@ def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> 
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"run": other.to_json()}))
     before = (folder / "train.jsonl").read_bytes()
-    with pytest.raises(InputError, match=r"of another version of pcil \(learner.agent.*24"):
+    with pytest.raises(InputError, match=r"of another version \(learner.agent.*24"):
         runs.execute(other, folder, runs.Silent())
     assert (folder / "train.jsonl").read_bytes() == before
 

@@ -291,7 +291,7 @@ def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[St
         counters = Counters(**meta["counters"])
     except (ValueError, TypeError) as error:
         raise InputError(
-            f"The checkpoint in {folder} is of another version of pcil ({error}); go on with that one, or give another --out."
+            f"The checkpoint in {folder} is of another version ({error}); go on with that one, or give another --out."
         ) from error
     if counters.final_return is None:
         if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:

@@ -133,7 +133,7 @@ def test_a_run_is_made_again_from_its_description(trained: Path) -> None:
 def test_a_run_of_before_a_setting_was_there_is_made_again(trained: Path) -> None:
     settings = flat(json.loads((trained / "pcil" / "run.json").read_text())["run"])
     older = {name: value for name, value in settings.items() if name not in ("agent.noise_correlation", "reward.stages")}
-    assert len(older) == len(settings) - 2 and representation.completed(older) == settings
+    assert len(older) == len(settings) - 2 and representation.with_defaults(older) == settings
 
 
 @pytest.mark.parametrize(

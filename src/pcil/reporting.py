@@ -27,7 +27,7 @@ def report(
         from pcil.report import load, page
     except ImportError as error:
         raise InputError(f"A report needs {error.name}, which pip install '.[report]' in a clone brings.") from error
-    found = load.collect([path.expanduser() for path in paths], _completed)
+    found = load.collect([path.expanduser() for path in paths], _with_defaults)
     page.clear(out := out.expanduser())
     films: dict[str, bytes] = {}
     if rollouts and found.sources:
@@ -39,8 +39,8 @@ def report(
     return 0
 
 
-def _completed(settings: dict[str, Any]) -> dict[str, Any]:
-    """`pcil.representation:completed`, which loads JAX: a report of files of results alone does without."""
-    from pcil.representation import completed
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """`pcil.representation:with_defaults`, which loads JAX: a report of files of results alone does without."""
+    from pcil.representation import with_defaults
 
-    return completed(settings)
+    return with_defaults(settings)

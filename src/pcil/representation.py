@@ -64,7 +64,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     return project(expert, agent, reward, row._replace(frames=frames))
 
 
-def completed(settings: dict[str, Any]) -> dict[str, Any]:
+def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
     try:
         return flat(_made(settings).plain.to_json()) | settings

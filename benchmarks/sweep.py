@@ -21,8 +21,8 @@ settings.evaluate_every = {frames}
 def main() -> None:
     """Prints the seconds of the whole command, Ray's start and every run's imports included, and frames a second."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=4)
-    parser.add_argument("--frames", type=int, default=12_000)
+    parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("--frames", type=int, default=30_000)
     parser.add_argument("--task", default="pendulum_swingup")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:

@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -265,6 +266,24 @@ def test_a_worker_waits_for_the_one_that_it_replaces(tmp_path: Path, monkeypatch
         fcntl.flock(forever, fcntl.LOCK_EX)
         monkeypatch.setattr(sweep, "PATIENCE_SECONDS", 0.01)
         sweep._wait_until_free(tmp_path / ".lock")  # and comes back
+
+
+def test_runs_of_one_machine_have_cores_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three runs of two cores on five: the third finds one free, takes none, and has its turn when a run has ended."""
+    bound = []
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 4, 5, 6, 7})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
+    first, second, third = (sweep._own_cores(2) for _ in range(3))
+    assert bound == [{3, 4}, {5, 6}]
+    first.close()
+    with sweep._own_cores(3), sweep._own_cores(1):
+        assert bound == [{3, 4}, {5, 6}, {3, 4, 7}], "for the last one nothing is left"
+    second.close()
+    third.close()
+    monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
+    sweep._own_cores(1).close()
+    assert len(bound) == 3
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "head:many"])

@@ -11,6 +11,7 @@ import secrets
 import shlex
 import socket
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Iterator
@@ -140,7 +141,7 @@ def _train_all(ray: Any, plan: Plan, limit: int | None, signals: Signals) -> Ite
         waiting = [job for job in plan.jobs if job.state == "waiting" and not signals.number]
         for job in waiting[: max((limit or _room(ray, plan)) - len(running), 0)]:
             job.state = "running"
-            running[task.options(name=job.name).remote(job.words, job.log, Path.cwd())] = job
+            running[task.options(name=job.name).remote(job.words, job.log, Path.cwd(), plan.cores)] = job
         if signals.number and not asked:
             asked = True
             for ref in running:
@@ -198,7 +199,7 @@ def picture(jobs: list[Job], speed: float, room: int) -> Group:
     return Group(table, bar)
 
 
-def _train(words: list[str], log: Path, home: Path) -> int:
+def _train(words: list[str], log: Path, home: Path, cores: int) -> int:
     """In a worker of Ray, which becomes `python -m pcil train ...`, so that whatever kills it leaves no process behind.
 
     What is printed goes to the end of `log`. Returns the exit code.
@@ -211,6 +212,7 @@ def _train(words: list[str], log: Path, home: Path) -> int:
     with contextlib.suppress(OSError):
         os.chdir(home)  # paths of demonstrations and modules of rewards are relative to where the sweep was started
     _wait_until_free(log.with_suffix("") / ".lock")
+    held = _own_cores(cores)
     sys.argv = ["pcil", "train", *words]
     try:
         runpy.run_module("pcil", run_name="__main__")
@@ -220,7 +222,31 @@ def _train(words: list[str], log: Path, home: Path) -> int:
         traceback.print_exc()
     finally:
         sys.stdout.flush()
+        held.close()
     return 1
+
+
+def _own_cores(count: int) -> contextlib.ExitStack:
+    """Bind this process to so many cores that no other run of this user has on this machine, until what it returns is closed.
+
+    A core is whose lock on its file it is, so a killed run frees its own. Without as many free ones, or where the system can't
+    bind, nothing is bound: a run that wanders between cores is slower, and its result the same.
+    """
+    locks, cores = contextlib.ExitStack(), set()
+    with contextlib.suppress(OSError, AttributeError):
+        folder = Path(tempfile.gettempdir()) / f"pcil-cores-{os.getuid()}"
+        folder.mkdir(exist_ok=True)
+        for core in sorted(os.sched_getaffinity(0)):
+            with contextlib.ExitStack() as attempt, contextlib.suppress(BlockingIOError):
+                file = attempt.enter_context((folder / str(core)).open("w"))
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                locks.push(attempt.pop_all())
+                cores.add(core)
+            if len(cores) == count:
+                os.sched_setaffinity(0, cores)
+                return locks
+    locks.close()
+    return locks
 
 
 def _wait_until_free(lock: Path) -> None:

@@ -401,7 +401,7 @@ class Spy(Reward):
 def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos: str, session: Session, tmp_path: Path) -> None:
     """Four runs: two that Ctrl-C stops, one that is done, one that fails; all on this machine's loopback device alone."""
     Path("spy_reward.py").write_text(SPY)
-    text = f"{PRODUCT.replace('300', '5000')}[settings]\ndemos = '{demos}'\n{NARROW.replace('every = 100', 'every = 1000')}"
+    text = f"{PRODUCT.replace('300', '15000')}[settings]\ndemos = '{demos}'\n{NARROW.replace('every = 100', 'every = 1000')}"
     text += "[[runs]]\nseeds = [3]\nframes = 300\n[[runs]]\nseeds = [1]\nvariants.spy.reward = 'spy_reward:Spy'\n"
     one, two, done, bad = plan(text).jobs
     finish(done.run, done.folder)
@@ -417,7 +417,7 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos:
     assert session.ends()
     for job in (one, two):
         job.look()
-        assert job.state == "waiting" and saved(job) == job.frames < 5000
+        assert job.state == "waiting" and saved(job) == job.frames < 15_000
     assert not bad.log.exists()
 
     process = session.start(*words)

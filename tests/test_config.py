@@ -264,8 +264,9 @@ def test_a_setting_of_another_kind_is_refused(change: dict[str, Any], said: str)
 
 
 def test_numpys_numbers_are_numbers() -> None:
-    Kinds(whole=np.int64(3), number=np.float32(0.5), maybe=np.int32(1))
-    Kinds(number=3, maybe=2, other="what is not known is not judged")
+    taken = Kinds(whole=np.int64(3), number=np.float32(0.5), maybe=np.int32(1))
+    assert (taken.whole, taken.number, taken.maybe) == (3, 0.5, 1)
+    assert Kinds(number=3, other="what is not known is not judged").other
 
 
 def test_no_third_word_is_taken_in_python_either() -> None:

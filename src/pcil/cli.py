@@ -72,7 +72,6 @@ def _run(run: "Run", out: Path) -> int:
     """Execute with a progress bar; end with a plain statement of how close to the expert it came, and the curve."""
     from pcil import envs, loop, progress, runs
 
-    out = out.expanduser()
     demos = runs.demonstrations(run)
     expert = demos.return_mean if demos else _shipped_return(envs.task_name(run.task))
     with progress.Bar(progress.Screen(), expert) as bar:
@@ -85,8 +84,8 @@ def _run(run: "Run", out: Path) -> int:
             bar.say(f"The run in {out} is done.")
         share = f", {progress.compared(result.final_return, expert)}" if expert is not None else ""
         bar.say(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
-        bar.say(f"Policy: {out / 'policy'}")
-        _draw_curve(out, expert, bar)
+        bar.say(f"Policy: {result.folder / 'policy'}")
+        _draw_curve(result.folder, expert, bar)
     return 0
 
 

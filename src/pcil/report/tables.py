@@ -100,11 +100,13 @@ def aggregate(found: Collection) -> Table:
     the same frames.
     """
     rows = []
-    for name, tasks in _by_method(found.points, stats.share_of_expert).items():
-        scores = list(tasks.values())
+    for name, tasks in _by_method(found.points).items():
+        shares = (stats.share_of_expert(runs, _final(runs)[1]) for runs in tasks.values())
+        if not (scores := [share for share in shares if share is not None]):
+            continue
         ends = map(float, stats.bootstrap(_mean_of_tasks, scores))
         mean = Interval(float(_mean_of_tasks(*scores)), *ends)
-        rows.append((*name, mean, stats.iqm_interval(scores), len(tasks), sum(map(len, scores))))
+        rows.append((*name, mean, stats.iqm_interval(scores), len(scores), sum(map(len, scores))))
     return Table(("method", "variant", "mean", "IQM", "tasks", "runs"), rows)
 
 
@@ -135,11 +137,8 @@ def improvement(found: Collection) -> Table:
     On the same task and at the last evaluation that both have (of a method that takes no step in the environment, its last), a
     tie being half; the mean over the tasks that both have, with a bootstrap interval.
     """
-    groups: dict[Any, dict[str, list[list[Point]]]] = {}
-    for (task, *name), runs in curves(found.points).items():
-        groups.setdefault(tuple(name), {})[task] = runs
     rows = []
-    for (ours, x), (theirs, y) in itertools.combinations(groups.items(), 2):
+    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points).items(), 2):
         if pairs := [_at_the_same_frames(x[task], y[task]) for task in x if task in y]:
             chance = stats.probability_of_improvement(*zip(*pairs, strict=True))
             rows.append((*ours, *theirs, chance, len(pairs)))
@@ -233,12 +232,11 @@ def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.
     return last[: len(x)], last[len(x) :]
 
 
-def _by_method(points: Sequence[Point], score: Callable[..., np.ndarray | None]) -> dict[Any, dict[str, np.ndarray]]:
-    """Final scores by method and variant, then by task."""
-    found: dict[Any, dict[str, np.ndarray]] = {}
+def _by_method(points: Sequence[Point]) -> dict[Any, dict[str, list[list[Point]]]]:
+    """The seeds' rows by method and variant, then by task."""
+    found: dict[Any, dict[str, list[list[Point]]]] = {}
     for (task, *name), runs in curves(points).items():
-        if (scores := score(runs, _final(runs)[1])) is not None:
-            found.setdefault(tuple(name), {})[task] = scores
+        found.setdefault(tuple(name), {})[task] = runs
     return found
 
 

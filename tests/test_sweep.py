@@ -13,7 +13,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -268,22 +267,39 @@ def test_a_worker_waits_for_the_one_that_it_replaces(tmp_path: Path, monkeypatch
         sweep._wait_until_free(tmp_path / ".lock")  # and comes back
 
 
-def test_runs_of_one_machine_have_cores_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_of_one_machine_have_cores_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three runs of two cores on five: the third finds one free, takes none, and has its turn when a run has ended."""
-    bound = []
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 4, 5, 6, 7})
-    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
+    bound, machine = [], os.getpid() << 8  # cores that no real run has
+    five = {machine + core for core in range(5)}
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: five)
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append({core - machine for core in cores}))
     first, second, third = (sweep._own_cores(2) for _ in range(3))
-    assert bound == [{3, 4}, {5, 6}]
+    assert bound == [{0, 1}, {2, 3}]
     first.close()
     with sweep._own_cores(3), sweep._own_cores(1):
-        assert bound == [{3, 4}, {5, 6}, {3, 4, 7}], "for the last one nothing is left"
+        assert bound == [{0, 1}, {2, 3}, {0, 1, 4}], "for the last one nothing is left"
     second.close()
     third.close()
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
     sweep._own_cores(1).close()
     assert len(bound) == 3
+
+
+def test_a_killed_run_frees_its_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process binds as this one does, but says so on a line."""
+    core, bound = (os.getpid() << 8) + 7, []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {core})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
+    text = f"import os\nos.sched_getaffinity = lambda _: {{{core}}}\nos.sched_setaffinity = lambda *_: print(flush=True)\n"
+    text += "from pcil import sweep\nheld = sweep._own_cores(1)\ninput()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", text], **pipes) as other:
+        assert other.stdout.readline() == "\n"
+        with sweep._own_cores(1):
+            assert bound == []
+        other.kill()
+    with sweep._own_cores(1):
+        assert bound == [{core}]
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "head:many"])
@@ -369,6 +385,31 @@ def episodes(job: plans.Job) -> int:
     return log.read_bytes().count(b"\n") if log.exists() else 0
 
 
+def worker(job: plans.Job) -> int:
+    """The process that trains it."""
+    return int(re.findall(r"^\S+, process (\d+): pcil train", job.log.read_text(), re.M)[-1])
+
+
+@contextlib.contextmanager
+def held(jobs: list[plans.Job], process: subprocess.Popen[str]) -> Iterator[None]:
+    """All of them after their third episode: whichever is there first stands still, and none ends before another has begun."""
+    still = {}
+
+    def arrived() -> bool:
+        for job in jobs:
+            if job.name not in still and episodes(job) >= 3:
+                os.kill(worker(job), signal.SIGSTOP)
+                still[job.name] = worker(job)
+        return len(still) == len(jobs)
+
+    try:
+        until(arrived, process)
+        yield
+    finally:
+        for pid in still.values():
+            os.kill(pid, signal.SIGCONT)
+
+
 def contents(job: plans.Job) -> dict[Path, tuple[int, bytes]]:
     """Every file of its folder, with the time of its last change."""
     files = [path for path in job.folder.rglob("*") if path.is_file()]
@@ -409,9 +450,10 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos:
     words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]
 
     process = session.start(*words)
-    until(lambda: min(episodes(one), episodes(two)) >= 3, process)
-    assert session.listening() and all(re.fullmatch("(0{16}FFFF0000)?0100007F|0{24}01000000", a) for a in session.listening())
-    process.send_signal(signal.SIGINT)
+    with held([one, two], process):
+        listening = session.listening()
+        assert listening and all(re.fullmatch("(0{16}FFFF0000)?0100007F|0{24}01000000", address) for address in listening)
+        process.send_signal(signal.SIGINT)
     printed, _ = process.communicate(timeout=400)
     assert process.returncode == 130 and "the same command goes on from here" in printed
     assert session.ends()
@@ -449,11 +491,6 @@ cluster.shutdown()
 """
 
 
-def worker(job: plans.Job) -> int:
-    """The process that trains it."""
-    return int(re.findall(r"^\S+, process (\d+): pcil train", job.log.read_text(), re.M)[-1])
-
-
 @pytest.mark.slow
 def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, tmp_path: Path) -> None:
     """Two nodes with a core each. One run's worker is killed, then the other run's whole node: all end as if left alone."""
@@ -465,8 +502,8 @@ def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, 
     lines = iter(nodes.stdout.readline, "")
     address, raylet = next(line.split()[1:] for line in lines if line.startswith("at "))
     process = session.start("-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--address", address)
-    until(lambda: min(episodes(jobs[0]), episodes(jobs[1])) >= 3, process)
-
+    with held(jobs[:2], process):
+        pass
     parents = {job.name: Path(f"/proc/{worker(job)}/stat").read_text().rpartition(")")[2].split()[1] for job in jobs[:2]}
     (there,) = (job for job in jobs[:2] if parents[job.name] == raylet)
     (here,) = (job for job in jobs[:2] if parents[job.name] != raylet)

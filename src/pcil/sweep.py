@@ -11,7 +11,6 @@ import secrets
 import shlex
 import socket
 import sys
-import tempfile
 import time
 import traceback
 from collections.abc import Iterator
@@ -227,26 +226,24 @@ def _train(words: list[str], log: Path, home: Path, cores: int) -> int:
 
 
 def _own_cores(count: int) -> contextlib.ExitStack:
-    """Bind this process to so many cores that no other run of this user has on this machine, until what it returns is closed.
+    """Bind this process to so many cores that no other run of a sweep has on this machine, until what it returns is closed.
 
-    A core is whose lock on its file it is, so a killed run frees its own. Without as many free ones, or where the system can't
-    bind, nothing is bound: a run that wanders between cores is slower, and its result the same.
+    A core is whose socket has its name, in the namespace that all users of a Linux machine share and that no file is in; a
+    killed run frees its own. Without as many free ones, or where the system can't bind, nothing is bound: a run that wanders
+    between cores is slower, and its result the same.
     """
-    locks, cores = contextlib.ExitStack(), set()
-    with contextlib.suppress(OSError, AttributeError):
-        folder = Path(tempfile.gettempdir()) / f"pcil-cores-{os.getuid()}"
-        folder.mkdir(exist_ok=True)
+    names, cores = contextlib.ExitStack(), set()
+    with contextlib.suppress(AttributeError):
         for core in sorted(os.sched_getaffinity(0)):
-            with contextlib.ExitStack() as attempt, contextlib.suppress(BlockingIOError):
-                file = attempt.enter_context((folder / str(core)).open("w"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                locks.push(attempt.pop_all())
+            with contextlib.ExitStack() as attempt, contextlib.suppress(OSError):
+                attempt.enter_context(socket.socket(socket.AF_UNIX)).bind(f"\0pcil-core-{core}")
+                names.push(attempt.pop_all())
                 cores.add(core)
             if len(cores) == count:
                 os.sched_setaffinity(0, cores)
-                return locks
-    locks.close()
-    return locks
+                return names
+    names.close()
+    return names
 
 
 def _wait_until_free(lock: Path) -> None:

@@ -28,7 +28,8 @@ def random_cost(rows: int, columns: int, seed: int) -> np.ndarray:
 
 def plan_of(cost: np.ndarray, epsilon: float, iterations: int, weight: np.ndarray | None = None) -> np.ndarray:
     weight = np.full(cost.shape[1], 1 / cost.shape[1]) if weight is None else weight
-    return np.asarray(sinkhorn_plan(jnp.asarray(cost), jnp.asarray(weight, jnp.float32), epsilon, iterations))
+    weights = (jnp.asarray(share, jnp.float32) for share in (np.full(len(cost), 1 / len(cost)), weight))
+    return np.asarray(sinkhorn_plan(jnp.asarray(cost), *weights, epsilon, iterations))
 
 
 def naive_plan(cost: np.ndarray, epsilon: float, rounds: int) -> np.ndarray:
@@ -80,24 +81,27 @@ def test_cost_falls_to_that_of_the_exact_plan_as_epsilon_shrinks() -> None:
 
 
 def test_padding_gets_no_mass_and_changes_nothing() -> None:
+    """Of rows and of columns, also where the cost there is no number."""
     cost = random_cost(12, 10, 4)
-    padded = np.concatenate([cost, np.full((12, 3), 0.5, np.float32)], axis=1)
-    plan = plan_of(padded, 0.01, 100, np.array([1 / 10] * 10 + [0.0] * 3))
-    assert not plan[:, 10:].any()
-    assert np.array_equal(plan[:, :10], plan_of(cost, 0.01, 100))
+    padded = np.pad(cost, ((0, 2), (0, 3)), constant_values=np.nan)
+    x_weight, y_weight = (jnp.asarray([1 / n] * n + [0.0] * spare, jnp.float32) for n, spare in ((12, 2), (10, 3)))
+    plan = np.array(sinkhorn_plan(jnp.asarray(padded), x_weight, y_weight, 0.01, 100))
+    assert np.array_equal(plan[:12, :10], plan_of(cost, 0.01, 100))
+    plan[:12, :10] = 0
+    assert not plan.any()
 
 
 def test_many_at_once_are_one_by_one() -> None:
-    costs, weight = np.stack([random_cost(8, 6, seed) for seed in range(4)]), jnp.full((4, 6), 1 / 6)
-    together = jax.vmap(lambda c, w: sinkhorn_plan(c, w, 0.01, 100))(jnp.asarray(costs), weight)
+    costs, weights = np.stack([random_cost(8, 6, seed) for seed in range(4)]), (jnp.full(8, 1 / 8), jnp.full((4, 6), 1 / 6))
+    together = jax.vmap(lambda c, w: sinkhorn_plan(c, weights[0], w, 0.01, 100))(jnp.asarray(costs), weights[1])
     assert all(np.array_equal(plan, plan_of(cost, 0.01, 100)) for plan, cost in zip(together, costs, strict=True))
 
 
 def test_no_gradient_flows_through_the_plan() -> None:
     """`d/dC sum M C` with `M` held fixed is `M` itself."""
     cost, weight = jnp.asarray(random_cost(8, 8, 5)), jnp.full(8, 1 / 8)
-    gradient = jax.grad(lambda c: jnp.sum(sinkhorn_plan(c, weight, 0.05, 100) * c))(cost)
-    assert np.array_equal(gradient, sinkhorn_plan(cost, weight, 0.05, 100))
+    gradient = jax.grad(lambda c: jnp.sum(sinkhorn_plan(c, weight, weight, 0.05, 100) * c))(cost)
+    assert np.array_equal(gradient, sinkhorn_plan(cost, weight, weight, 0.05, 100))
 
 
 def test_compiled_code_calls_back_again_and_again_without_waiting_for_itself() -> None:
@@ -106,7 +110,7 @@ def test_compiled_code_calls_back_again_and_again_without_waiting_for_itself() -
 
     @jax.jit
     def step(cost: jax.Array, total: jax.Array) -> tuple[jax.Array, jax.Array]:
-        plan = jax.lax.cond(total < 1e9, lambda: sinkhorn_plan(cost, weight, 0.01, 2), lambda: cost)
+        plan = jax.lax.cond(total < 1e9, lambda: sinkhorn_plan(cost, weight, weight, 0.01, 2), lambda: cost)
         return jnp.roll(cost @ jnp.eye(500), 1, axis=0), total + jnp.sum(plan)
 
     total = jnp.zeros(())

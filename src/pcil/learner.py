@@ -104,7 +104,7 @@ def close_episode(method: Method, learner: Learner, episode: Episode, count: int
     """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
     if type(method.reward).after_episode is Reward.after_episode:
         return learner
-    reward = _after_rows(method, learner, episode.obs, episode.action, np.int32(count))
+    reward = _after_rows(method, learner, *_padded(method, episode)[:2], np.int32(count))
     return Learner(learner.agent, reward, learner.root, learner.totals)
 
 
@@ -115,16 +115,20 @@ def _after_rows(method: Method, learner: Learner, obs: Array, action: Array, cou
 
 
 def label_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
-    """The reward of each step of one whole episode.
+    """The reward of each step of one whole episode."""
+    return np.asarray(_label_rows(method, learner, *_padded(method, episode), np.int32(count)))[: len(episode)]
 
-    A reward for which rows behind the end make no difference is computed on a multiple of `LABEL_ROWS` rows, so that episodes
-    of many lengths share a few compilations; another one is given exactly the episode.
+
+def _padded(method: Method, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Observations, actions and true rewards of an episode, so that episodes of many lengths share a few compilations.
+
+    A reward for which rows behind the end make no difference gets a multiple of `LABEL_ROWS` rows, with NaN for the actions
+    that are not there; another one gets exactly the episode.
     """
-    steps = len(episode)
-    spare = -steps % LABEL_ROWS if method.reward.scope == "step" or method.reward.looks_back else 0
-    obs, action = (np.pad(array, ((0, spare), (0, 0)), mode="edge") for array in (episode.obs, episode.action))
-    true = np.pad(episode.reward.astype(np.float32), (0, spare))
-    return np.asarray(_label_rows(method, learner, obs, action, true, np.int32(count)))[:steps]
+    spare = -len(episode) % LABEL_ROWS if method.reward.scope == "step" or method.reward.takes_padding else 0
+    obs = np.pad(episode.obs, ((0, spare), (0, 0)), mode="edge")
+    action = np.pad(episode.action, ((0, spare), (0, 0)), constant_values=np.nan)
+    return obs, action, np.pad(episode.reward.astype(np.float32), (0, spare))
 
 
 @functools.partial(jax.jit, static_argnames="method")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -136,6 +137,21 @@ def test_only_rewards_of_whole_episodes_depend_on_other_steps(settings: Reward, 
     swapped = np.roll(np.arange(200)[: 3 * period], period)
     moved = Batch(AGENT.obs[swapped], AGENT.action[swapped])
     assert np.allclose(rewards_of(settings, trained, moved), rewards_of(settings, trained, AGENT)[swapped], atol=1e-5)
+
+
+def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trained: Any) -> None:
+    """Of a reward that says so, whatever the states are there; one that doesn't is never given any."""
+    steps, behind = np.s_[:70], np.full((30, 2), np.nan, np.float32)
+    episode = Batch(AGENT.obs[steps], AGENT.action[steps])
+    padded = Batch(AGENT.obs[:100], np.concatenate([episode.action, behind]))
+    whole = settings.scope == "episode"
+    assert settings.takes_padding == whole
+    if whole:
+        after = functools.partial(settings.after_episode, trained, embed=embed, key=jax.random.key(9))
+        states = [after(obs=jnp.asarray(given.obs), action=jnp.asarray(given.action)) for given in (episode, padded)]
+        assert all(np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, states), strict=True))
+        got, expected = (rewards_of(settings, states[0], given)[steps] for given in (padded, episode))
+        assert np.allclose(got, expected, rtol=1e-4, atol=1e-6) and np.ptp(expected) > 0
 
 
 def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) -> None:

@@ -107,6 +107,19 @@ def test_the_first_episode_fixes_the_scale_of_all(method: str) -> None:
     assert np.allclose(learner.label_episode(run.learner, state, second, 1), unscaled * scale, rtol=1e-4)
 
 
+@pytest.mark.parametrize("method", ["sil", "potil"])
+def test_episodes_of_many_lengths_share_one_compilation(method: str) -> None:
+    run = run_of(method)
+    state = learner.init(run.learner, Spec(2, 2, 1), [random_batch(30, 2, 2, 5)], 0)
+    for steps in (20, 30, 40):
+        episode = episode_of(random_batch(steps, 2, 2, steps))
+        state = learner.close_episode(run.learner, state, episode, 0)
+        assert learner.label_episode(run.learner, state, episode, 0).shape == (steps,)
+        if steps == 20:
+            compiled = learner._label_rows._cache_size(), learner._after_rows._cache_size()
+    assert (learner._label_rows._cache_size(), learner._after_rows._cache_size()) == compiled
+
+
 def test_without_a_first_sum_rewards_stay_unscaled() -> None:
     run = run_of("potil", first_sum=0.0)
     state = learner.init(run.learner, Spec(2, 2, 1), [random_batch(30, 2, 2, 5)], 0)

@@ -43,12 +43,12 @@ class Reward(abc.ABC):
     """An imitation reward: learned from demonstrations and from what the agent does.
 
     `scope` says what `reward` must be given: "step" for any steps in any order, "episode" for one whole episode in the order
-    of time. `looks_back` says of the latter that a step's reward depends on no later step. `needs_demos` is False where no
-    demonstrations are used at all.
+    of time. `takes_padding` says of the latter that rows whose actions are NaN, which stand behind the episode's end, change
+    nothing. `needs_demos` is False where no demonstrations are used at all.
     """
 
     scope: ClassVar[Literal["step", "episode"]] = "step"
-    looks_back: ClassVar[bool] = False
+    takes_padding: ClassVar[bool] = False
     needs_demos: ClassVar[bool] = True
 
     task_weight: float = 0.0

@@ -74,7 +74,7 @@ class PWIL(Reward):
     """Settings of PWIL's reward, `alpha exp(-sigma c)` with `c` the cost of the step's part of the coupling."""
 
     scope: ClassVar[Literal["step", "episode"]] = "episode"
-    looks_back: ClassVar[bool] = True
+    takes_padding: ClassVar[bool] = True
 
     batch_size: int = 0
     """Nothing is learned, so no steps are drawn."""

@@ -42,6 +42,12 @@ class Demos(eqx.Module):
         return cls(obs, action, weight[..., 0])
 
 
+def step_weights(action: Float[Array, "T action"]) -> Float[Array, " T"]:
+    """One over the number of steps, and 0 for the rows behind them."""
+    steps = (~jnp.isnan(action[:, 0])).astype(jnp.float32)
+    return steps / jnp.sum(steps)
+
+
 class SinkhornState(eqx.Module):
     """What an episode is compared with, in which space, and how rewards are scaled."""
 
@@ -62,6 +68,7 @@ class SinkhornReward(Reward):
     """What SIL and POTIL share: `r_i = -scale sum_j M_ij C_ij` with the plan `M` between the episode and a demonstration."""
 
     scope: ClassVar[Literal["step", "episode"]] = "episode"
+    takes_padding: ClassVar[bool] = True
 
     epsilon: float = 0.01
     """Weight of the plan's entropy; costs reach 2, and `exp(-cost / epsilon)` is 0 in float64 beyond 745."""
@@ -81,11 +88,16 @@ class SinkhornReward(Reward):
         """Each step's part of the transport cost."""
 
     def match(
-        self, x: Float[Array, "T dim"], y: Float[Array, "steps dim"], weight: Float[Array, " steps"]
+        self,
+        x: Float[Array, "T dim"],
+        y: Float[Array, "steps dim"],
+        x_weight: Float[Array, " T"],
+        y_weight: Float[Array, " steps"],
     ) -> Float[Array, " T"]:
         """Each row's part of the transport from `x` to `y`, `sum_j M_ij C_ij`."""
         cost = cosine_cost(x, y)
-        return jnp.sum(sinkhorn_plan(cost, weight, self.epsilon, self.iterations) * cost, axis=-1)
+        plan = sinkhorn_plan(cost, x_weight, y_weight, self.epsilon, self.iterations)
+        return jnp.sum(jnp.where(plan > 0, plan * cost, 0.0), axis=-1)
 
     def reward(
         self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
@@ -171,7 +183,8 @@ class SIL(SinkhornReward):
 
         def learn() -> Adversary:
             cost = cosine_cost(old.critic(x), old.critic(y))
-            plan = sinkhorn_plan(cost, jnp.full(len(y), 1 / len(y)), self.epsilon, self.iterations)
+            x_weight, y_weight = (jnp.full(len(rows), 1 / len(rows)) for rows in (x, y))
+            plan = sinkhorn_plan(cost, x_weight, y_weight, self.epsilon, self.iterations)
             loss, gradient = jax.value_and_grad(self.loss)(old.critic, x, y, plan)
             critic, moments = adam_step(old.critic, gradient, old.moments, self.learning_rate)
             return Adversary(critic, moments, -loss, old.updates)
@@ -186,7 +199,7 @@ class SIL(SinkhornReward):
         demos, which = state.demos, jax.random.randint(key, (), 0, len(state.demos.obs))
         both = self.seen(obs, action, embed), self.seen(demos.obs[which], demos.action[which], embed)
         x, y = (state.space.critic(seen) for seen in both)
-        return self.match(x, y, demos.weight[which])
+        return self.match(x, y, step_weights(action), demos.weight[which])
 
 
 @dataclass(frozen=True)
@@ -219,7 +232,7 @@ class POTIL(SinkhornReward):
     def costs(
         self, state: SinkhornState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
     ) -> Float[Array, " T"]:
-        del action, embed, key
-        x, y = state.space.embed(obs), state.space.embed(state.demos.obs)
-        costs = jax.vmap(lambda demo, weight: self.match(x, demo, weight))(y, state.demos.weight)
+        del embed, key
+        x, y, steps = state.space.embed(obs), state.space.embed(state.demos.obs), step_weights(action)
+        costs = jax.vmap(lambda demo, weight: self.match(x, demo, steps, weight))(y, state.demos.weight)
         return costs[jnp.argmin(jnp.sum(costs, axis=1))]

@@ -20,6 +20,8 @@ import numpy as np
 from pcil import envs, learner, presets
 from pcil.demos import Demonstrations
 from pcil.replay import Replay
+from pcil.rewards import states_read
+from pcil.types import Batch
 
 CASES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("dac", {}),
@@ -50,7 +52,8 @@ def main(task: str = "walker_walk") -> None:
     print(f"{task}: {len(demos)} demonstrations of {len(demos[0])} steps\n{'':<32}{'label, ms':>12}{'update, ms':>12}")
     for method, changes in CASES:
         run = presets.make(task, method, **changes)
-        state = learner.init(run.learner, spec, tuple(episode.batch for episode in demos), 1)
+        batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
+        state = learner.init(run.learner, spec, batches, 1)
         label = processor_ms(lambda run=run, state=state: learner.label_episode(run.learner, state, demos[0], 0), 5)
         window = expert.sample(rng, run.agent.batch_size, run.agent.n_step)
         rows = expert.sample(rng, run.reward.batch_size, run.reward.span) if run.reward.batch_size else None

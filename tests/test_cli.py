@@ -286,7 +286,7 @@ def test_a_reward_of_ones_own_brings_its_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One that needs whole episodes can be had with `--label stored`, and is refused with the default label."""
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     (tmp_path / "reward_of_mine.py").write_text(
         "from dataclasses import dataclass\n"
         "from pcil.rewards import TaskReward\n"

@@ -27,8 +27,3 @@ def test_an_absorbed_episode_never_terminates_and_pays_the_same(steps: int, term
     if terminated:
         assert np.array_equal(after.obs[steps:], [[0, 0, 1]] * (rest + 1))
         assert not after.action[steps:].any() and not after.reward[steps:].any()
-
-
-def test_the_batch_of_an_episode_leaves_the_last_observation_out() -> None:
-    episode = make_episode(4, True)
-    assert np.array_equal(episode.batch.obs, episode.obs[:4]) and np.array_equal(episode.batch.action, episode.action)

@@ -6,7 +6,6 @@ import functools
 import importlib
 import io
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -80,7 +79,6 @@ def _load_reward(spec: str) -> Any:
     from pcil.rewards import Reward
 
     module, _, name = spec.partition(":")
-    sys.path.insert(0, "")
     try:
         kind = getattr(importlib.import_module(module), name)
         if not (isinstance(kind, type) and issubclass(kind, Reward)):

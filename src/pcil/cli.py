@@ -21,6 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 on bad input, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
     # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # a module of one's own environment or reward may lie in the present folder
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = _command(words)

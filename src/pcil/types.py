@@ -70,11 +70,6 @@ class Episode:
     def __len__(self) -> int:
         return len(self.action)
 
-    @property
-    def batch(self) -> Batch:
-        """The states in which an action was taken, and those actions."""
-        return Batch(self.obs[:-1], self.action)
-
     def absorbed(self, steps: int = 1) -> Episode:
         """The same episode with a further entry in each observation, 1 in the absorbing state and 0 elsewhere.
 

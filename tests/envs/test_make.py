@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -165,10 +164,10 @@ def test_near_misses_are_recognised(name: str, meant: str) -> None:
         make(name)
 
 
-def test_an_environment_of_ones_own_lies_in_the_present_folder_or_is_refused_with_its_reason(
-    monkeypatch: pytest.MonkeyPatch,
+def test_an_environment_of_ones_own_is_found_or_refused_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    monkeypatch.syspath_prepend(tmp_path)
     text = "import gymnasium\ngymnasium.register('pcil_test/Own-v0', 'gymnasium.envs.classic_control:PendulumEnv')\n"
     Path("my_own_module.py").write_text(text)
     Path("my_bad_module.py").write_text("raise ValueError('boom')\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import sys
 import warnings
 from typing import Any, NoReturn
 
@@ -79,8 +78,6 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
     if render_mode is not None and env_id in _TOYS:
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
     render: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
-    if ":" in env_id:
-        sys.path.insert(0, "")  # the module may lie in the present folder
     try:
         env = gymnasium.make(env_id, disable_env_checker=True, **render)
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:

@@ -2,18 +2,18 @@
 
 With --check nothing is written; exit code 1 where a table is stale. A page asks for a table of a report by a pair of marks
 such as `<!-- finals:pcil-200k -->` and `<!-- /finals:pcil-200k -->`: the table's name, and the file of results it is made of.
+`<!-- demos -->` and `<!-- /demos -->` ask for what ships.
 """
 
 from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 from pcil.demos import shipped
-from pcil.report import figures, stats, tables
+from pcil.report import figures, tables
 from pcil.report.load import Collection, Dot, Point, read_points
 
 ROOT = Path(__file__).parent.parent
@@ -23,11 +23,10 @@ MARKED = re.compile(r"(<!-- ([\w:-]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
 
 def main(words: list[str]) -> int:
     """Every table, and the figures too unless only a check is asked for."""
-    own: dict[str, Callable[[], str]] = {"demos": demos_table, "pcil": lambda: finals_table(results("pcil-200k"))}
 
     def fresh(mark: re.Match[str]) -> str:
         name, _, file = mark[2].partition(":")
-        return mark[1] + (tables.markdown(tables.MAKERS[name](results(file))) if file else own[name]()) + mark[3]
+        return mark[1] + (tables.markdown(tables.MAKERS[name](results(file))) if file else demos_table()) + mark[3]
 
     stale = 0
     for page in PAGES:
@@ -55,25 +54,11 @@ def results(name: str) -> Collection:
 
 def demos_table() -> str:
     """What ships: `pcil demos` in Markdown."""
-    lines = ["| task | observation | action | episodes | return | expert |", "|---|---|---|---|---|---|"]
+    rows = []
     for row in shipped():
         returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
-        sizes = f"{row['observation_dim']} | {row['action_dim']} | {row['episodes']}"
-        lines.append(f"| {row['task']} | {sizes} | {returns} | {row['expert']} |")
-    return "\n".join([*lines, ""])
-
-
-def finals_table(found: Collection) -> str:
-    """The last evaluation of each seed, and their mean with Student's 95% interval beside the demonstrations' return."""
-    lines = ["| task | demonstrations | seed: final return | mean [95% interval] | of the expert |", "|---|---|---|---|---|"]
-    for task in dict.fromkeys(point.task for point in found.points):
-        last = {point.seed: point for point in found.points if point.task == task}  # rows are in the order of time
-        mean = stats.mean_interval([point.return_mean for point in last.values()])
-        expert = next(point.expert_return for point in last.values())
-        seeds = ", ".join(f"{seed}: {point.return_mean:.1f}" for seed, point in last.items())
-        share = f"{mean.value / expert:.0%}" if expert else ""
-        lines.append(f"| {task} | {expert:.1f} | {seeds} | {tables.cell(mean)} | {share} |")
-    return "\n".join([*lines, ""])
+        rows.append((row["task"], row["observation_dim"], row["action_dim"], row["episodes"], returns, row["expert"]))
+    return tables.markdown(tables.Table(("task", "observation", "action", "episodes", "return", "expert"), rows))
 
 
 if __name__ == "__main__":

@@ -337,8 +337,8 @@ class Session:
         return found
 
     def ends(self) -> bool:
-        """Whether all of them end by themselves soon."""
-        end = time.monotonic() + 30
+        """Whether all of them end by themselves, however busy the machine is."""
+        end = time.monotonic() + 400
         while self.members() and time.monotonic() < end:
             time.sleep(0.1)
         return not self.members()

@@ -285,6 +285,28 @@ def test_runs_of_one_machine_have_cores_of_their_own(monkeypatch: pytest.MonkeyP
     assert len(bound) == 3
 
 
+@pytest.mark.parametrize("threads", [{0: "0-1", 1: "0-1", 2: "2-3", 3: "2-3"}, {0: "0,2", 2: "0,2", 1: "1,3", 3: "1,3"}])
+def test_second_threads_of_a_core_are_taken_last(
+    threads: dict[int, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bound: list[set[int]] = []
+    monkeypatch.setattr(sweep, "TOPOLOGY", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {number(core) for core in threads})
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
+
+    def number(core: int) -> int:
+        return (os.getpid() << 8) + 16 + core
+
+    for core, siblings in threads.items():
+        (tmp_path / f"cpu{number(core)}" / "topology").mkdir(parents=True)
+        text = re.sub(r"\d", lambda digit: str(number(int(digit[0]))), siblings)
+        (tmp_path / f"cpu{number(core)}" / "topology" / "thread_siblings_list").write_text(f"{text}\n")
+    first = [core for core, siblings in threads.items() if siblings.startswith(str(core))]
+    with sweep._own_cores(1), sweep._own_cores(1), sweep._own_cores(2):
+        assert bound[:2] == [{number(core)} for core in sorted(first)]
+        assert bound[2] == {number(core) for core in set(threads) - set(first)}
+
+
 def test_a_killed_run_frees_its_core(monkeypatch: pytest.MonkeyPatch) -> None:
     """The other process binds as this one does, but says so on a line."""
     core, bound = (os.getpid() << 8) + 7, []

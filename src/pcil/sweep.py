@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import logging
 import os
+import re
 import runpy
 import secrets
 import shlex
@@ -34,6 +35,8 @@ RETRIES = 8
 PATIENCE_SECONDS = 60.0
 """How long it then waits for the old worker to let go of the folder: on a node that is cut off it lives a little longer."""
 
+TOPOLOGY = Path("/sys/devices/system/cpu")
+"""Where Linux says which cores are two threads of one."""
 VISIBLE_SECONDS = 15.0
 """How long a finished run's DONE is waited for."""
 
@@ -229,12 +232,12 @@ def _own_cores(count: int) -> contextlib.ExitStack:
     """Bind this process to so many cores that no other run of a sweep has on this machine, until what it returns is closed.
 
     A core is whose socket has its name, in the namespace that all users of a Linux machine share and that no file is in; a
-    killed run frees its own. Without as many free ones, or where the system can't bind, nothing is bound: a run that wanders
-    between cores is slower, and its result the same.
+    killed run frees its own. Second threads of a core are taken last. Without as many free ones, or where the system can't
+    bind, nothing is bound: a run that wanders between cores is slower, and its result the same.
     """
     names, cores = contextlib.ExitStack(), set()
     with contextlib.suppress(AttributeError):
-        for core in sorted(os.sched_getaffinity(0)):
+        for core in sorted(os.sched_getaffinity(0), key=lambda core: (_is_second_thread(core), core)):
             with contextlib.ExitStack() as attempt, contextlib.suppress(OSError):
                 attempt.enter_context(socket.socket(socket.AF_UNIX)).bind(f"\0pcil-core-{core}")
                 names.push(attempt.pop_all())
@@ -244,6 +247,14 @@ def _own_cores(count: int) -> contextlib.ExitStack:
                 return names
     names.close()
     return names
+
+
+def _is_second_thread(core: int) -> bool:
+    try:
+        threads = (TOPOLOGY / f"cpu{core}" / "topology" / "thread_siblings_list").read_text()
+    except OSError:
+        return False
+    return int(re.split("[-,]", threads)[0]) != core
 
 
 def _wait_until_free(lock: Path) -> None:

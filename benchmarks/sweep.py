@@ -1,8 +1,12 @@
-"""Runs side by side: the same runs with one job and with two, and the ratio of their speeds: `python benchmarks/sweep.py`."""
+"""Runs side by side: the same runs with one job and with two, and the ratio of their speeds: `python benchmarks/sweep.py`.
+
+Once of whole commands, with the start of Ray and the imports of each run, and once of the training alone, as `eval.csv` has it.
+"""
 
 from __future__ import annotations
 
 import argparse
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -19,7 +23,7 @@ settings.evaluate_every = {frames}
 
 
 def main() -> None:
-    """Prints the seconds of the whole command, Ray's start and every run's imports included, and frames a second."""
+    """Prints seconds and frames a second of one job and of two, and the ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--frames", type=int, default=30_000)
@@ -27,22 +31,26 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         sweep(Path(folder) / "compiled", given.task, [0], 2500, jobs=1)  # the others find the compiled programs in the cache
-        speeds = []
+        seconds = []
         for jobs in (1, 2):
-            seconds = sweep(Path(folder) / str(jobs), given.task, list(range(given.runs)), given.frames, jobs)
-            speeds.append(given.runs * given.frames / seconds)
-            print(f"--jobs {jobs}: {given.runs} runs in {seconds:.1f} s, {speeds[-1]:,.0f} frames/s", flush=True)
-    print(f"ratio {speeds[1] / speeds[0]:.2f}")
+            seconds.append(sweep(Path(folder) / str(jobs), given.task, list(range(given.runs)), given.frames, jobs))
+            whole, each = seconds[-1]
+            rates = f"{given.runs * given.frames / whole:,.0f} frames/s, {given.frames / each:,.0f} in training"
+            print(f"--jobs {jobs}: {given.runs} runs in {whole:.1f} s, {each:.1f} s of training each; {rates}", flush=True)
+    (one, alone), (two, beside) = seconds
+    print(f"ratio {one / two:.2f}; of training {2 * alone / beside:.2f}")
 
 
-def sweep(folder: Path, task: str, seeds: list[int], frames: int, jobs: int) -> float:
-    """Seconds that the command takes."""
+def sweep(folder: Path, task: str, seeds: list[int], frames: int, jobs: int) -> tuple[float, float]:
+    """Seconds that the command takes, and the mean of those that its runs train."""
     folder.mkdir()
     (folder / "sweep.toml").write_text(FILE.format(task=task, seeds=seeds, frames=frames))
     words = ["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", str(jobs)]
     began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "pcil", *words], check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - began
+    took = time.perf_counter() - began
+    logs = (folder / "runs").rglob("eval.csv")
+    return took, statistics.mean(float(log.read_text().split()[-1].rpartition(",")[2]) for log in logs)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
-    "errors types seeds compilation",
+    "errors types seeds files compilation",
     "losses transport optimiser networks noise theory",
     "envs minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop runs progress",
@@ -87,13 +87,18 @@ def test_agents_and_rewards_know_nothing_of_each_other() -> None:
 
 
 def test_the_report_imports_no_jax() -> None:
-    """In a fresh process, so that what its imports import counts too; it takes nothing of the package but the error and the
-    theory."""
+    """In a fresh process, so that what its imports import counts too; it takes nothing of the package but the error, the
+    readers of files and the theory."""
     names = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in SOURCES if part(path) == "report"]
     code = f"import sys, {', '.join(names)}; print(*sorted(sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "pcil.report.page" in loaded and not {"jax", "equinox", "gymnasium", "mujoco", "sklearn"} & set(loaded)
-    assert set().union(*(parts_imported(path) for path in SOURCES if part(path) == "report")) == {"report", "errors", "theory"}
+    assert set().union(*(parts_imported(path) for path in SOURCES if part(path) == "report")) == {
+        "report",
+        "errors",
+        "files",
+        "theory",
+    }
     lazily = {name for path in SOURCES if part(path) == "report" for name in imported(path)}
     assert not any(re.match(r"(jax|equinox|optax)\b", name) for name in lazily)
 

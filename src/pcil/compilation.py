@@ -1,9 +1,12 @@
-"""JAX's persistent compilation cache, on by default: the second run of the same settings starts at once."""
+"""How JAX starts: on which devices, and with its persistent cache, so that the second run of a kind starts at once."""
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
+
+from pcil.errors import InputError
 
 
 def cache_folder() -> Path:
@@ -13,10 +16,43 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pcil" / "jax"
 
 
-def use_cache() -> None:
-    """Turn the cache on for this process; where the folder can't be written, compile without it."""
+def start() -> None:
+    """Start JAX's devices; `InputError` where there are none, or none of the kind that `JAX_PLATFORMS` asks for.
+
+    A plugin that does not work here, such as CUDA's without a GPU, is one line on standard error, where JAX has a traceback.
+    """
     import jax
 
+    failed: list[str] = []
+
+    def heard(record: logging.LogRecord) -> bool:
+        if record.exc_info and record.exc_info[1]:
+            failed.append(" ".join(str(record.exc_info[1]).split())[:200])
+        return not record.exc_info
+
+    logger = logging.getLogger("jax._src.xla_bridge")
+    logger.addFilter(heard)
+    try:
+        devices = jax.devices()
+    except Exception as error:  # JAX has no one type for it
+        told = " ".join(str(error).split()).partition(" (set JAX_PLATFORMS")[0]
+        reason = "; ".join(filter(None, [*failed, told])) or "there is no such device here"
+        setting = f" with JAX_PLATFORMS={asked}" if (asked := jax.config.jax_platforms) else ""
+        raise InputError(
+            f"JAX can't start{setting} ({reason[:300]}); unset JAX_PLATFORMS or set it to cpu, and for a GPU "
+            "pip install '.[cuda]' in a clone."
+        ) from error
+    finally:
+        logger.removeFilter(heard)
+    if failed and not jax.config.jax_platforms:
+        logger.warning("A plugin of JAX does not work here (%s); JAX computes on %s.", failed[0], devices[0].platform)
+
+
+def use_cache() -> None:
+    """Start JAX, and turn the cache on for this process; where its folder can't be written, compile without it."""
+    import jax
+
+    start()
     try:
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)

@@ -54,6 +54,9 @@ def _mujoco() -> str:
 def _devices() -> str:
     import jax
 
+    from pcil import compilation
+
+    compilation.start()
     return f"jax {jax.__version__}: " + ", ".join(str(device) for device in jax.devices())
 
 

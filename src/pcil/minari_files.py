@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pcil.errors import InputError
+from pcil.files import read_json
 from pcil.types import Episode
 
 
@@ -22,7 +23,7 @@ def read(data: Path) -> tuple[str, list[Episode], dict[str, Any]]:
 
     where, episodes = str(data), []
     try:
-        metadata = json.loads((data / "metadata.json").read_bytes())
+        metadata = read_json(data / "metadata.json")
         environment = json.loads(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", data.name)
         own = {"task": task_of(environment), "info": metadata} | metadata.get("pcil", {})
         # Were the spaces missing, Minari would make the environment, and so run whatever code the file names.

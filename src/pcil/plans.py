@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import math
 import os
 import re
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pcil import arguments, envs, runs
+from pcil import arguments, envs, files, runs
 from pcil.config import Run
 from pcil.errors import InputError
 from pcil.report.load import read_evaluations
@@ -58,7 +57,7 @@ class Job:
         with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
             with (self.folder / "train.jsonl").open("rb") as file:
                 file.seek(max(file.seek(0, os.SEEK_END) - 10_000, 0))
-                last = json.loads(file.read().split(b"\n")[-2])
+                last = files.parse_json(file.read().split(b"\n")[-2])
             self.frames, self.rate = last["frames"], last["frames_per_second"]
             table = read_evaluations(self.folder)
             self.last_return = float(table["return"][table["frames"] == table["frames"][-1]].mean())
@@ -75,8 +74,8 @@ class Plan(NamedTuple):
 def read(file: Path, out: Path) -> Plan:
     """The runs of a file, each checked as `pcil train` checks it, and how they stand. Nothing is written."""
     try:
-        table = tomllib.loads(file.read_text())
-    except (OSError, ValueError) as error:
+        table = tomllib.loads(files.read_text(file))
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{file} can't be read as TOML ({error}).") from error
     _check(str(file), table, FILE)
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))

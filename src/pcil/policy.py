@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from pcil import files
 from pcil.errors import InputError
 from pcil.networks import MLP, Actor, Trunk
 from pcil.types import Spec
@@ -71,10 +72,10 @@ def load_policy(path: str | Path) -> Policy:
             f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made."
         )
     try:
-        header = json.loads((folder / "policy.json").read_text())
+        header = files.read_json(folder / "policy.json")
         arrays = _read(folder / "policy.safetensors")
         actor = _build(header, arrays)
-    except (ValueError, LookupError, TypeError, AttributeError, SafetensorError, OSError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, SafetensorError, OSError) as error:
         raise InputError(
             f"The policy in {folder} is damaged ({type(error).__name__}: {error}); train or copy it again."
         ) from error

@@ -66,8 +66,9 @@ class Signals:
 
     def __enter__(self) -> Signals:
         numbers = {signal.SIGINT, signal.SIGTERM}
-        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-            numbers.add(signal.SIGHUP)
+        hangup = getattr(signal, "SIGHUP", None)  # Windows has none
+        if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
+            numbers.add(hangup)
         self._before = {number: signal.signal(number, self._ask) for number in numbers}
         return self
 

@@ -25,7 +25,11 @@ _NEVER = 2**62
 
 def add(found: Collection) -> None:
     """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not."""
-    compilation.use_cache()
+    try:
+        compilation.use_cache()
+    except InputError as error:
+        found.notes.append(f"The representations are left out: {error}")
+        return
     refused: list[Exception] = []
     for name, source in found.sources.items():
         last = [point for point in found.points if point[:4] == name][-1]

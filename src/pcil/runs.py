@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import platform
@@ -15,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from pcil import compilation, envs, loop, presets
+from pcil import compilation, envs, files, loop, presets
 from pcil.config import Run, completed, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
@@ -90,8 +89,8 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
 def read_done(folder: Path) -> float:
     """The final return of a finished run: the mean of its last evaluation."""
     try:
-        return float(json.loads((folder / "DONE").read_text())["final_return"])
-    except (OSError, ValueError, LookupError, TypeError) as error:
+        return float(files.read_json(folder / "DONE")["final_return"])
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError) as error:
         raise InputError(
             f"{folder / 'DONE'} can't be read ({type(error).__name__}: {error}); delete it, and the same command ends the run."
         ) from error
@@ -125,14 +124,11 @@ def _claimed(folder: Path) -> Iterator[None]:
         strangers = sorted(path.name for path in folder.iterdir() if path.name != ".lock" and path.suffix != ".tmp")
         if strangers and "run.json" not in strangers:
             raise InputError(f"The folder {folder} holds something else ({strangers[0]}); give --out a new or empty folder.")
-        lock = (folder / ".lock").open("w")
     except OSError as error:
         raise InputError(f"The folder {folder} can't be written ({error.strerror}); give --out another one.") from error
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InputError(f"Another process is training in {folder}; wait for it or give --out another folder.") from None
+    with files.locked(folder / ".lock") as free:
+        if not free:
+            raise InputError(f"Another process is training in {folder}; wait for it or give --out another folder.")
         yield
 
 
@@ -152,7 +148,10 @@ def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
 def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: loop.Reporter) -> None:
     """Write `run.json`, or check that the one which is there describes this very run."""
     identity = _identity(run, demos)
-    versions = {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):  # DeepMind Control may be absent
+            versions[name] = metadata.version(name)
     path = folder / "run.json"
     if not path.exists():
         _write(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
@@ -166,7 +165,7 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
 def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
-        before = json.loads((folder / "run.json").read_text())
+        before = files.read_json(folder / "run.json")
         changed = differences(completed(before["run"], run.plain.to_json()), identity["run"])
         changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -198,7 +197,7 @@ def provenance(folder: Path, policy: Policy, command: str) -> dict[str, Any]:
     frames, seed = policy.info.get("frames"), policy.info.get("seed")
     path = folder / "run.json"
     try:
-        trained = json.loads(path.read_text()) if path.exists() else {}
+        trained = files.read_json(path) if path.exists() else {}
         known = {name: trained.get(name) for name in ("commit", "run", "versions")}
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"{path} can't be read ({error}), so nobody could say where the demonstrations are from.") from error

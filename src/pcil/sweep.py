@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import re
@@ -23,7 +22,7 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from pcil import bench
+from pcil import bench, files
 from pcil.errors import InputError
 from pcil.plans import Job, Plan, read
 from pcil.progress import Signals, time_left
@@ -258,10 +257,11 @@ def _is_second_thread(core: int) -> bool:
 
 
 def _wait_until_free(lock: Path) -> None:
-    """Give the worker that this one replaces time to die; of one that never does, `pcil train` will tell."""
+    """Give the worker that this one replaces time to die; `pcil train` says what is wrong with a lock that is never free."""
     until = time.monotonic() + PATIENCE_SECONDS
-    while lock.exists() and time.monotonic() < until:
-        with lock.open("a") as file, contextlib.suppress(BlockingIOError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        time.sleep(0.5)
+    with contextlib.suppress(InputError):
+        while lock.exists() and time.monotonic() < until:
+            with files.locked(lock) as free:
+                if free:
+                    return
+            time.sleep(0.5)

@@ -80,6 +80,8 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
     render: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
     try:
         env = gymnasium.make(env_id, disable_env_checker=True, **render)
+    except InputError as error:
+        raise InputError(f"The environment {task!r} can't be made: {error}") from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
         raise InputError(f"The environment {task!r} needs a package that is not installed: {error}") from error
     except gymnasium.error.Error as error:
@@ -137,16 +139,19 @@ def _gymnasium_id(task: str) -> str:
 
 
 def _suite_tasks() -> list[str]:
-    """Every task of DeepMind Control's suite by name; imports dm_control, which takes half a second."""
+    """Every task of DeepMind Control's suite by name, none where it is not installed; the import takes half a second."""
     from pcil.envs.dmc import import_suite
 
-    return [f"{domain}_{name}" for domain, name in import_suite().ALL_TASKS]
+    try:
+        return [f"{domain}_{name}" for domain, name in import_suite().ALL_TASKS]
+    except InputError:
+        return []
 
 
 def _refuse_name(task: str, error: Exception) -> NoReturn:
-    known = [*TASKS, *gymnasium.registry, *_suite_tasks()]
-    near = difflib.get_close_matches(task, known, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    suite = _suite_tasks()
+    near = difflib.get_close_matches(task, [*TASKS, *gymnasium.registry, *suite], n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else "" if suite else " where DeepMind Control is not installed"
     raise InputError(
         f"There is no environment {task!r}{hint}: give one of {', '.join(TASKS)}, another task of DeepMind Control's "
         "suite, or any Gymnasium id."

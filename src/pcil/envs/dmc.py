@@ -178,7 +178,7 @@ def _model_warnings_unsaid() -> Iterator[None]:
 
 
 def import_suite() -> ModuleType:
-    """`dm_control.suite`, imported so that a machine without OpenGL is no hindrance.
+    """`dm_control.suite`, imported so that a machine without OpenGL is no hindrance; `InputError` where it is not installed.
 
     Unless `MUJOCO_GL` says otherwise, dm_control looks for a window system while it is imported. We keep it from that
     for the length of the import; `enable_rendering` brings OpenGL in when someone asks for pictures.
@@ -188,6 +188,11 @@ def import_suite() -> ModuleType:
         os.environ["MUJOCO_GL"] = "disabled"
     try:
         return importlib.import_module("dm_control.suite")
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"DeepMind Control is not installed here ({error}): pip install dm-control on Python 3.11 or 3.12; its package "
+            "labmaze has no wheel for later ones."
+        ) from error
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
         if chosen is None:
             raise

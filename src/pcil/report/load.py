@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from pcil.errors import InputError
+from pcil.files import parse_json, read_json
 
 OFFLINE = ("bc",)
 """Methods that take no step in the environment; their frames only count updates, two frames each where actions are repeated."""
@@ -106,7 +106,7 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
     runs = []
     for folder in folders.values():
         try:
-            rows, about = read_run(folder), json.loads((folder / "run.json").read_text())
+            rows, about = read_run(folder), read_json(folder / "run.json")
             runs.append((rows, Source(folder, complete(flat(about["run"])), (folder / "DONE").exists())))
         except InputError as error:
             notes.append(str(error))
@@ -159,9 +159,9 @@ def matrix(runs: Sequence[Sequence[Point]], value: str = "return_mean") -> tuple
 def read_run(folder: Path, variant: str | None = None) -> list[Point]:
     """The evaluations of a run folder in the order of time. `InputError` where the folder holds no run."""
     try:
-        about, columns, log = json.loads((folder / "run.json").read_text()), read_evaluations(folder), folder / "train.jsonl"
+        about, columns, log = read_json(folder / "run.json"), read_evaluations(folder), folder / "train.jsonl"
         whole = log.read_text().split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line at the end
-        episodes = [episode for line in whole if "correlation" in (episode := json.loads(line))]
+        episodes = [episode for line in whole if "correlation" in (episode := parse_json(line))]
         run, expert = about["run"], (about["demos"] or {}).get("return_mean")
         head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
         tail = {"expert_return": expert and round(float(expert), 4), "commit": about["commit"] or ""}
@@ -175,7 +175,7 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
             seconds, health = float(columns["seconds"][now][0]), round(float(np.mean(fresh)), 4) if fresh else None
             points.append(Point(**head, frames=int(frames), **returns, **tail, seconds=seconds, correlation=health))
             before = frames
-    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise InputError(f"{folder} holds no run that can be read ({error}); give folders that pcil train made.") from error
     if not points:
         raise InputError(f"The run in {folder} has no evaluation yet; let it go on for a moment.")

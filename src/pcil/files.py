@@ -1,0 +1,78 @@
+"""Files as they may lie in a folder: locks that follow no link and empty nothing, small text and JSON read within limits."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pcil.errors import InputError
+
+LARGEST = 16 * 2**20
+"""Bytes of a file that is read whole."""
+DIGITS = 300
+"""Of a whole number in JSON; a float holds no more."""
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[bool]:
+    """Hold the lock of a file, which is made if need be; False where another process holds it.
+
+    The lock ends with the process, however that ends, and the file stays. `InputError` with the reason where the system
+    refuses the lock, or where the file is a link.
+    """
+    import filelock
+
+    lock = filelock.FileLock(path, fallback_to_soft=False)  # soft locks outlive a killed process
+    try:
+        if path.is_symlink():
+            raise OSError("it is a link")
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        yield False
+        return
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(
+            f"{path} can't be locked against other processes ({reason}); delete it if it is no plain file, or use a folder "
+            "where files can be made and locked."
+        ) from error
+    try:
+        yield True
+    finally:
+        lock.release()
+
+
+def read_text(path: Path, limit: int = LARGEST) -> str:
+    """The text of a regular file; `ValueError` where it is a pipe, a device or larger than so many bytes, `OSError` as ever."""
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # a pipe nobody writes to must not block
+    with open(os.open(path, flags), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError("it is no regular file")
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise ValueError(f"it is larger than {limit:,} bytes")
+    return content.decode()
+
+
+def read_json(path: Path, limit: int = LARGEST) -> Any:
+    """What a JSON file holds; `ValueError` or `OSError` where it can't be read."""
+    return parse_json(read_text(path, limit))
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What JSON text says; `ValueError` too where it is nested too deeply, or holds a whole number that no float holds."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > DIGITS:
+        raise ValueError(f"it holds a number of {len(digits):,} digits")
+    return int(digits)

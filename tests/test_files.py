@@ -1,0 +1,250 @@
+"""Locks follow no link, empty nothing, end with their process and say why they fail; text and JSON are read within limits."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small import save_point_mass_demos, small_run
+
+import pcil
+from pcil import cli, files, loop, runs
+from pcil.errors import InputError
+
+HOLD = "import sys, time; from pathlib import Path; from pcil import files\nwith files.locked(Path(sys.argv[1])) as free:\n"
+HOLD += "    print(free, flush=True)\n    time.sleep(60)\n"
+WINDOWS = """
+import sys, warnings
+for name in ("fcntl", "resource", "termios", "tty", "pty", "pwd", "grp", "readline", "curses"):
+    sys.modules[name] = None
+import os, signal
+for name in ("SIGHUP", "SIGKILL", "SIGSTOP", "SIGCONT", "SIGQUIT", "SIGUSR1", "SIGALRM", "SIGPIPE"):
+    delattr(signal, name)
+for name in ("sched_getaffinity", "sched_setaffinity", "getuid", "fork", "killpg", "getloadavg", "O_NOFOLLOW", "O_NONBLOCK"):
+    delattr(os, name)
+import importlib, pkgutil, pcil
+for module in pkgutil.walk_packages(pcil.__path__, "pcil."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+from pcil.progress import Signals
+with Signals(lambda: None):
+    pass
+print("all")
+"""
+
+
+# --- Locks ---
+
+
+def test_a_lock_is_held_by_one_process_and_freed_when_it_is_killed(tmp_path: Path) -> None:
+    lock = tmp_path / ".lock"
+    with subprocess.Popen([sys.executable, "-c", HOLD, str(lock)], stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout and holder.stdout.readline() == "True\n"
+        with files.locked(lock) as free:
+            assert not free
+        holder.send_signal(signal.SIGKILL)
+        holder.wait()
+    for _ in range(2):
+        with files.locked(lock) as free:
+            assert free and lock.exists()
+
+
+def test_what_lies_in_a_locked_file_stays(tmp_path: Path) -> None:
+    (tmp_path / ".lock").write_text("keep me\n")
+    with files.locked(tmp_path / ".lock") as free:
+        assert free
+    assert (tmp_path / ".lock").read_text() == "keep me\n"
+
+
+def test_a_link_is_refused_and_what_it_names_stays_by_every_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Also one that leads nowhere: nothing is made where it points to."""
+    (tmp_path / "precious.txt").write_text("keep me\n")
+    for folder, target in (("linked", "precious.txt"), ("dangling", "nowhere")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / ".lock").symlink_to(tmp_path / target)
+        for words in (
+            "train toy/point_mass-v0 --method expert --out",
+            "train toy/nothing-v0 --out",
+            "evaluate",
+            "report --out r",
+        ):
+            assert cli.main([*words.split(), folder]) == 2
+            assert capsys.readouterr().err.count("\n") == 1
+        with pytest.raises(InputError, match=r"\.lock can't be locked .*it is a link.*delete it"):
+            pcil.train("toy/point_mass-v0", method="expert", out=folder)
+        assert [path.name for path in (tmp_path / folder).iterdir()] == [".lock"]
+    assert (tmp_path / "precious.txt").read_text() == "keep me\n" and not (tmp_path / "nowhere").exists()
+
+
+def test_a_link_that_comes_between_the_look_and_the_lock_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "precious.txt").write_text("keep me\n")
+    (tmp_path / ".lock").symlink_to(tmp_path / "precious.txt")
+    monkeypatch.setattr(Path, "is_symlink", lambda _: False)
+    with pytest.raises(InputError, match="can't be locked"), files.locked(tmp_path / ".lock"):
+        pass
+    assert (tmp_path / "precious.txt").read_text() == "keep me\n"
+
+
+def test_a_folder_behind_a_link_can_be_trained_in(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "runs").symlink_to(tmp_path / "disk")
+    with files.locked(tmp_path / "runs" / ".lock") as free:
+        assert free and (tmp_path / "disk" / ".lock").is_file()
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EIO])
+def test_where_locking_fails_the_reason_is_said_and_not_another_process(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(InputError) as caught:
+        pcil.train("toy/point_mass-v0", method="expert", out=tmp_path / "run")
+    assert os.strerror(number) in str(caught.value) and "nother process is" not in str(caught.value)
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {".lock"}
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.EISDIR])
+def test_where_a_lock_can_not_be_made_the_reason_is_said(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.open
+
+    def refuse(path: Any, *options: Any, **more: Any) -> int:
+        if str(path).endswith(".lock"):
+            raise OSError(number, os.strerror(number))
+        return real(path, *options, **more)
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(InputError, match=os.strerror(number)):
+        pcil.train("toy/point_mass-v0", method="expert", out=tmp_path / "run")
+
+
+def test_every_module_imports_without_what_windows_lacks() -> None:
+    """In a process of its own, without the modules, signals and functions that Unix alone has."""
+    result = subprocess.run([sys.executable, "-W", "ignore", "-c", WINDOWS], capture_output=True, text=True)
+    assert (result.stdout, result.stderr) == ("all\n", "")
+
+
+# --- Text and JSON ---
+
+
+def test_text_is_read_up_to_its_limit(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("äöü")
+    assert files.read_text(tmp_path / "file", 6) == "äöü"
+    with pytest.raises(ValueError, match="larger than 5 bytes"):
+        files.read_text(tmp_path / "file", 5)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[" * 100_000 + "]" * 100_000, "nested too deeply"),
+        ("1" * 400, "a number of 400 digits"),
+        ("1" * 5000, "a number of 5,000 digits"),
+        ("-" + "1" * 400, "digits"),
+        ('{"a": ', "Expecting value"),
+        ("", "Expecting value"),
+        ("\x00", "Expecting value"),
+    ],
+    ids=lambda text: text[:10],
+)
+def test_json_that_can_not_be_read_is_a_value_error(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "file.json").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        files.read_json(tmp_path / "file.json")
+
+
+def test_json_is_what_it_was() -> None:
+    text = '{"a": [1, -2, 3.5, 1e3, true, null, "x", 123456789012345678901234567890], "b": Infinity}'
+    assert files.parse_json(text) == {
+        "a": [1, -2, 3.5, 1e3, True, None, "x", 123456789012345678901234567890],
+        "b": float("inf"),
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run."""
+    folder = tmp_path_factory.mktemp("finished")
+    runs.execute(small_run(demos=save_point_mass_demos(folder)), folder / "run", runs.Silent())
+    return folder / "run"
+
+
+HOSTILE = {
+    "deep": lambda path: path.write_text("[" * 100_000 + "]" * 100_000),
+    "digits": lambda path: path.write_text('{"final_return": %s}' % ("9" * 400)),
+    "large": lambda path: path.write_bytes(b" " * (files.LARGEST + 1) + b"{}"),
+    "bytes": lambda path: path.write_bytes(b"\xff\xfe{}"),
+    "pipe": os.mkfifo,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+}
+READERS = {
+    "run.json": ["record run --out recorded", "report run --out report"],
+    "policy/policy.json": ["evaluate run --episodes 1"],
+    "sweep.toml": ["sweep run/sweep.toml --out sweep"],
+}
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+@pytest.mark.parametrize("name", READERS)
+def test_a_hostile_file_is_one_sentence(
+    name: str, hostile: str, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = shutil.copytree(finished, tmp_path / "run")
+    (run / name).unlink(missing_ok=True)
+    HOSTILE[hostile](run / name)
+    for words in READERS[name]:
+        assert cli.main(words.split()) == 2
+        out, error = capsys.readouterr()
+        assert out == "" and error.startswith("pcil: ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_a_hostile_done_says_what_to_do(hostile: str, tmp_path: Path) -> None:
+    HOSTILE[hostile](tmp_path / "DONE")
+    with pytest.raises(InputError, match=r"DONE can't be read .*; delete it"):
+        runs.read_done(tmp_path)
+
+
+def test_a_policy_of_infinitely_many_layers_is_damaged(finished: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(finished, tmp_path / "run")
+    header = json.loads((run / "policy" / "policy.json").read_text())
+    (run / "policy" / "policy.json").write_text(json.dumps({**header, "layers": float("inf")}))
+    with pytest.raises(InputError, match="is damaged"):
+        pcil.load_policy(run)
+
+
+def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
+    """While it trains, the same lock is taken; afterwards it is free."""
+    seen = []
+
+    class Looks(runs.Silent):
+        """Tries the lock from another process after each episode."""
+
+        def episode(self, *_: Any) -> None:
+            code = "import sys; from pathlib import Path; from pcil import files\n"
+            code += "with files.locked(Path(sys.argv[1])) as free: print(free)"
+            result = subprocess.run([sys.executable, "-c", code, tmp_path / "run" / ".lock"], capture_output=True, text=True)
+            seen.append(result.stdout)
+
+        def stop(self) -> bool:
+            return True
+
+    with pytest.raises(loop.Stopped):
+        runs.execute(small_run("expert"), tmp_path / "run", Looks())
+    assert seen == ["False\n"]
+    with files.locked(tmp_path / "run" / ".lock") as free:
+        assert free

@@ -55,3 +55,14 @@ def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", f"{tmp_path}/home")
     assert look() == f"{tmp_path}/home/pcil/jax"
+
+
+def test_without_deepmind_control_the_physics_are_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name == "dm-control":
+            raise doctor.metadata.PackageNotFoundError(name)
+        return "3.17.0"
+
+    monkeypatch.setattr(doctor.metadata, "version", version)
+    (look,) = (look for name, look, _, _ in doctor.CHECKS if name == "physics")
+    assert look() == "mujoco 3.17.0, no dm-control"

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small import save_point_mass_demos, small_run
 
 import pcil
 from pcil import cli, files, loop, runs
 from pcil.errors import InputError
+from small import save_point_mass_demos, small_run
 
 HOLD = "import sys, time; from pathlib import Path; from pcil import files\nwith files.locked(Path(sys.argv[1])) as free:\n"
 HOLD += "    print(free, flush=True)\n    time.sleep(60)\n"

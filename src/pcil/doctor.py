@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import platform
 from collections.abc import Callable
@@ -46,9 +46,13 @@ def _versions(*names: str) -> Callable[[], str]:
 
 def _mujoco() -> str:
     version = metadata.version("mujoco")
+    try:
+        suite = f"dm-control {metadata.version('dm-control')}"
+    except metadata.PackageNotFoundError:
+        return f"mujoco {version}, no dm-control"
     if int(version.split(".")[0]) >= 4:
-        raise RuntimeError(f"mujoco {version} does not work with dm-control {metadata.version('dm-control')}")
-    return f"mujoco {version}, dm-control {metadata.version('dm-control')}"
+        raise RuntimeError(f"mujoco {version} does not work with {suite}")
+    return f"mujoco {version}, {suite}"
 
 
 def _devices() -> str:
@@ -106,12 +110,16 @@ def _importable(module: str, package: str) -> Callable[[], str]:
     return look
 
 
+_DMC_REMEDY = (
+    "pip install --force-reinstall dm-control 'mujoco<4'; from Python 3.13 on, where its package labmaze has no wheel: "
+    "pip install dm-env lxml and pip install --no-deps dm-control"
+)
 CHECKS: tuple[Check, ...] = (
     ("Python", _python, "install Python 3.11 or newer", True),
     ("networks", _versions("equinox", "optax", "numpy"), "pip install --force-reinstall pcil", True),
     ("physics", _mujoco, "pip install 'mujoco<4'", True),
     ("device", _devices, "pip install --force-reinstall jax; for a GPU: pip install '.[cuda]' in a clone", True),
-    ("environment", _environment, "pip install --force-reinstall dm-control 'mujoco<4'", True),
+    ("DeepMind Control", _environment, _DMC_REMEDY, importlib.util.find_spec("dm_control") is not None),
     ("demonstrations", _demonstrations, "pip install --force-reinstall pcil, or give --demos", False),
     ("compilation cache", _cache, "set JAX_COMPILATION_CACHE_DIR to a folder that can be written", False),
     ("figures", _importable("matplotlib", "matplotlib"), "pip install '.[report]' in a clone", False),

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
+import sys
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +15,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from pcil import envs
+from pcil import cli, envs, runs
 from pcil.envs import TASKS, make, register, spec, task_name
 from pcil.envs.timing import measure_env
 from pcil.errors import InputError
 from pcil.types import Spec
+from small import small_run
 
 SPECS = {
     "finger_spin": Spec(9, 2, 2),
@@ -190,3 +195,53 @@ def test_timing_has_bare_physics_only_for_deepmind_control() -> None:
     assert measured["env_step_us"] > measured["physics_us"] > 0.0
     with pytest.raises(InputError, match="bare physics"):
         measure_env("toy/point_mass-v0")
+
+
+@pytest.fixture
+def without_dmc(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a Python for which dm-control can't be installed."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "dm_control"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "dm_control", None)
+
+
+@pytest.mark.usefixtures("without_dmc")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train walker_walk --out run", "DeepMind Control is not installed here .*pip install"),
+        ("train dmc/walker_walk-v0 --out run", "DeepMind Control is not installed here .*pip install"),
+        ("train humanoid_walk --out run", "no environment 'humanoid_walk' where DeepMind Control is not installed"),
+        ("train Pendulum-v9 --out run", "Pendulum"),
+        ("bench", "DeepMind Control is not installed here"),
+        ("evaluate POLICIES/walker_walk", "DeepMind Control is not installed here"),
+        ("record POLICIES/walker_walk --out new", "DeepMind Control is not installed here"),
+    ],
+)
+def test_without_deepmind_control_its_tasks_say_what_is_missing(
+    words: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policies = str(Path(envs.__file__).parent.parent / "data" / "policies")
+    assert cli.main(words.replace("POLICIES", policies).split()) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and re.search(said, err) and not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("without_dmc")
+def test_without_deepmind_control_all_else_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What ships is listed, other environments are made, and a run says which versions it had."""
+    assert cli.main(["demos", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)) == len(TASKS)
+    assert spec(make("toy/point_mass-v0")) and spec(make("Pendulum-v1")) == Spec(3, 1, 1)
+    real = metadata.version
+
+    def version(name: str) -> str:
+        if name == "dm-control":
+            raise metadata.PackageNotFoundError(name)
+        return real(name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(metadata, "version", version)
+        runs.execute(small_run("expert", frames=150), tmp_path / "run", runs.Silent())
+    versions = json.loads((tmp_path / "run" / "run.json").read_text())["versions"]
+    assert versions["jax"] == real("jax") and "dm-control" not in versions

@@ -190,8 +190,8 @@ def import_suite() -> ModuleType:
         return importlib.import_module("dm_control.suite")
     except ModuleNotFoundError as error:
         raise InputError(
-            f"DeepMind Control is not installed here ({error}): pip install dm-control on Python 3.11 or 3.12; its package "
-            "labmaze has no wheel for later ones."
+            f"DeepMind Control is not installed here ({error}): pip install dm-control, or, from Python 3.13 on, where its "
+            "package labmaze has no wheel, pip install dm-env lxml and pip install --no-deps dm-control."
         ) from error
     except (ImportError, AttributeError, OSError, RuntimeError) as error:
         if chosen is None:

@@ -6,6 +6,9 @@ os.environ.setdefault("MUJOCO_GL", "disabled")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads only wait for each other; XLA has threads of its own
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # a worker a core
 
+import importlib.util
+import sys
+
 from jaxtyping import install_import_hook
 
 install_import_hook("pcil", "beartype.beartype")
@@ -14,10 +17,22 @@ import jax
 import pytest
 
 from pcil.compilation import use_cache
+from pcil.envs import dmc
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 use_cache()
+
+if importlib.util.find_spec("dm_control") is None:
+    real_import = dmc.import_suite
+
+    def skip_or_import() -> object:
+        """What needs DeepMind Control is skipped where it is not installed, unless the test itself takes it away."""
+        if "dm_control" in sys.modules:
+            return real_import()
+        return pytest.skip("DeepMind Control is not installed", allow_module_level=True)
+
+    dmc.import_suite = skip_or_import
 
 
 @pytest.fixture(autouse=True)

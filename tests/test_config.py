@@ -55,7 +55,7 @@ def test_a_preset_makes_a_run_that_survives_json(method: str, preset: str) -> No
 @pytest.mark.parametrize(("method", "preset"), EVERY_RUN)
 def test_equal_settings_share_one_compilation(method: str, preset: str) -> None:
     """What is compiled is found by its hash; seed, frames and task's name are no part of it."""
-    one, two = presets.make("hopper_stand", method, preset), presets.make("hopper_hop", method, preset, seed=7)
+    one, two = presets.make("cheetah_run", method, preset), presets.make("hopper_hop", method, preset, seed=7)
     assert one.learner == two.learner and hash(one.learner) == hash(two.learner)
     wider = dataclasses.replace(one, agent=dataclasses.replace(one.agent, hidden=512))
     assert wider.learner != one.learner
@@ -274,3 +274,25 @@ def test_no_third_word_is_taken_in_python_either() -> None:
     code = "from pcil import presets; presets.make('walker_walk', label='store')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "InputError: Run.label is 'store'; it must be one of 'sampled', 'stored'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("task", "batch", "frames", "steps"),
+    [
+        ("walker_walk", 256, 1_100_000, 100_000),
+        ("walker_run", 256, 3_100_000, 500_000),
+        ("pendulum_swingup", 128, 1_100_000, 100_000),
+        ("hopper_hop", 128, 3_100_000, 500_000),
+    ],
+)
+def test_released_has_the_batch_of_bc_and_the_length_of_an_expert_by_task(
+    task: str, batch: int, frames: int, steps: int
+) -> None:
+    """BC's batch is the agent's by bz_ratio = 2; experts are DrQ-v2's, whose tasks are easy or medium."""
+    cloned, agent = presets.make(task, "bc", "released").agent, presets.make(task, "pcil", "released").agent
+    assert cloned.batch_size == batch == agent.batch_size // 2 and cloned.hidden == agent.hidden == 1024
+    expert = presets.make(task, "expert", "released")
+    assert (expert.frames, expert.random_frames, expert.agent.noise.steps) == (frames, 4000, steps)
+    assert presets.make(task, "bc").agent.batch_size == presets.make(task, "bc", "paper").agent.batch_size == 128
+    assert presets.make(task, "expert", "released", frames=5000).frames == 5000
+    assert presets.make(task, "bc", "released", **{"agent.batch_size": 7}).agent.batch_size == 7

@@ -13,7 +13,7 @@ def broken() -> str:
 
 @pytest.fixture(autouse=True)
 def _wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setenv("COLUMNS", "500")
 
 
 def test_this_machine_can_train(capsys: pytest.CaptureFixture[str]) -> None:

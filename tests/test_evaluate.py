@@ -49,13 +49,14 @@ def one_by_one(environments: list[Walk], seed: int) -> tuple[list[float], list[i
     returns, lengths = [], []
     for i, env in enumerate(environments):
         obs, _ = env.reset(seed=episode_seed(seed, Stream.EVALUATE, i))
-        rewards, over = [], False
+        total, length, over = 0.0, 0, False
         while not over:
             obs, reward, terminated, truncated, _ = env.step(policy(obs))
-            rewards.append(reward)
+            total += reward  # one after the other: `sum` corrects its rounding errors from Python 3.12 on
+            length += 1
             over = terminated or truncated
-        returns.append(sum(rewards))
-        lengths.append(len(rewards))
+        returns.append(total)
+        lengths.append(length)
     return returns, lengths
 
 

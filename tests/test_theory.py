@@ -131,6 +131,61 @@ def test_what_holds_with_atoms(pair: tuple[np.ndarray, np.ndarray]) -> None:
         assert value >= theory.sharper_bound(mass) * tv - SOLVED
 
 
+@pytest.mark.parametrize(
+    ("largest", "atoms", "bound"),
+    [(7 / 32, (5, 6, 8, 12), lambda mass: np.full_like(mass, theory.LOWER)), (1 / 8, (9, 10, 16), theory.sharper_bound)],
+)
+def test_a_cap_on_the_experts_atoms_is_enough_for_every_policy(largest: float, atoms: tuple[int, ...], bound: Any) -> None:
+    """0.25 from 7/32 down, the sharper bound from 1/8 down; the policy is ahead at one to three states of any weight."""
+    rng = np.random.default_rng(0)
+    for number in atoms:
+        p = rng.dirichlet(np.full(number, 0.5), 60)
+        cut = np.minimum(p, largest)
+        room = largest - cut
+        p = cut + room * ((1 - cut.sum(axis=-1)) / room.sum(axis=-1))[:, None]  # what was cut off fills up the others
+        assert p.max() <= largest + EXACT
+        ahead = np.arange(number) >= number - rng.integers(1, 4, (len(p), 1))
+        q = np.where(ahead, p, p * rng.uniform(0, 1, (len(p), 1)))
+        q[:, -1] += 1 - q.sum(axis=-1)
+        tv, mass = theory.total_variation(p, q), theory.expert_mass(p, q)
+        assert np.all(theory.attained(p, q)[0] >= bound(mass) * tv - SOLVED)
+
+
+def test_where_an_atom_weighs_more_than_the_rest_off_s_the_cap_leaves_p_above_nine_sixteenths() -> None:
+    """The step of the proof, at its edge: an atom of 7/32 with just less than that beside it off S."""
+    p = np.array([*np.full(4, 9 / 64), 7 / 32, 7 / 32 - 1e-9, 1e-9])
+    assert p.sum() == 1 and p[4] > p[4:].sum() / 2 * (1 - 1e-8)
+    q = np.array([*np.zeros(4), 0.5, 0.4, 0.1])
+    assert theory.expert_mass(p, q) == pytest.approx(9 / 16) and theory.bound_with_atoms(np.array(9 / 16)) == 0.25
+    assert theory.attained(p, q)[0] >= theory.LOWER * theory.total_variation(p, q)
+
+
+def test_an_expert_without_a_dominant_state_may_fall_below_the_sharper_bound() -> None:
+    """Uniform on three states, and a policy that is always in one of them: two thirds, where the bound would say three quarters."""
+    p, q = np.full(3, 1 / 3), np.array([0.0, 0.0, 1.0])
+    value, phi = theory.attained(p, q)
+    tv, mass = theory.total_variation(p, q), theory.expert_mass(p, q)
+    assert value / tv == pytest.approx(2 / 3, abs=SOLVED) and theory.certificate(p, q, phi) / tv == pytest.approx(2 / 3, abs=SOLVED)
+    assert theory.sharper_bound(mass) == pytest.approx(3 / 4)
+
+
+def test_demonstrations_that_a_policy_never_meets_are_at_two_whatever_the_policy() -> None:
+    """Recorded states and a policy that comes near them but never to one: TV is 1 and D_cont 2, for near and far alike."""
+    p, q = np.repeat([[1 / 50], [0.0]], 50, axis=1).ravel(), np.repeat([[0.0], [1 / 50]], 50, axis=1).ravel()
+    assert theory.total_variation(p, q) == pytest.approx(1)
+    assert theory.attained(p, q)[0] == pytest.approx(2) == theory.relaxed(p, q)[0]
+
+
+@law
+@given(PAIRS, st.integers(0, 99))
+def test_a_function_with_a_negative_mean_is_no_coordinate_along_v(pair: tuple[np.ndarray, np.ndarray], seed: int) -> None:
+    """Off the axis the rest cancels, so v = (A, 0): with A below 0 it points the other way, and A is not its length."""
+    p, q = pair
+    g = np.random.default_rng(seed).uniform(-1, 1, len(p))
+    v = theory.halved(p) @ theory.halves_embedding(g)
+    assert v == pytest.approx([g @ p, 0], abs=EXACT) and np.linalg.norm(v) == pytest.approx(abs(g @ p), abs=EXACT)
+
+
 def test_every_random_failure_has_an_atom_that_outweighs_the_rest_off_s() -> None:
     p, q = random_weights(3, 400)
     below = theory.attained(p, q)[0] < theory.LOWER * theory.total_variation(p, q)

@@ -18,7 +18,11 @@ from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN, TaskReward
 
 
 def paper(task: str) -> dict[str, Any]:
-    """What the paper's text says; where it is silent, what the authors' code does."""
+    """What the paper's text says; where it is silent, what the authors' code does.
+
+    One sentence of the text is not followed: Appendix B gives the encoder "state s of a transition", and here, as in the authors'
+    code, a step is paid for the state that it leads to (docs/methods/pcil.md, point 14).
+    """
     return {
         "frames": 2_000_000,  # paper section 4.1
         "label": "stored",  # authors' train.py: rewards are computed when the episode ends
@@ -109,7 +113,26 @@ SIL_AS_RELEASED: dict[str, Any] = {
     "agent.noise": LinearSchedule(0.1, 0.1, 1),  # authors' cfgs: a constant 0.1
 }
 
-METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
+EASY = ("finger_spin", "hopper_stand", "pendulum_swingup", "walker_stand", "walker_walk")  # DrQ-v2 cfgs/task
+
+
+def bc_as_released(task: str) -> dict[str, Any]:
+    """BC with the batch of the task."""
+    batch = 256 if task.startswith("walker") else 128  # authors' agent/bc.py: batch_size // bz_ratio
+    return {**BC_SETTINGS, "agent": BC(batch_size=batch, hidden=1024)}  # authors' agent/bc.py, dmc.yaml
+
+
+def expert_as_released(task: str) -> dict[str, Any]:
+    """DrQ-v2 on the task's reward, with the frames and the exploration of its group of tasks."""
+    return {
+        "frames": 1_100_000 if task in EASY else 3_100_000,  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
+        "random_frames": 4000,  # DrQ-v2 cfgs/config.yaml: 2000 agent steps
+        "agent.noise": LinearSchedule(1.0, 0.1, 100_000 if task in EASY else 500_000),  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
+        "reward": TaskReward(),
+    }
+
+
+METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str, Any]]] = {
     ("pcil", "paper"): {"reward": PCIL(temperature=0.07)},  # paper Table
     ("pcil", "released"): {"reward": PCIL(temperature=1.0, hidden=1024)},  # authors' pcil.py: T is never applied; dmc.yaml
     ("pcil", "default"): {"reward": PCIL(temperature=1.0, learning_rate=5e-4)},  # ours: 0.07 does not learn
@@ -135,13 +158,13 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("tcn-gail", "released"): {"reward": TCN(temperature=0.07, hidden=1024, head="gail")},  # not in the release; as tcn
     ("tcn-gail", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4, head="gail")},  # as tcn
     ("bc", "paper"): {**BC_SETTINGS, "agent": BC()},  # authors' agent/bc.py; width of the paper's Table
-    ("bc", "released"): {**BC_SETTINGS, "agent": BC(hidden=1024)},  # authors' agent/bc.py, dmc.yaml
+    ("bc", "released"): bc_as_released,
     ("bc", "default"): {**BC_SETTINGS, "agent": BC()},  # as paper
     ("expert", "paper"): {"reward": TaskReward()},
-    ("expert", "released"): {"reward": TaskReward()},
+    ("expert", "released"): expert_as_released,
     ("expert", "default"): {"reward": TaskReward()},
 }
-"""What a method sets on top of a preset; a dotted name changes one setting of the preset's agent or of the reward."""
+"""What a method sets on top of a preset, for some on a task; a dotted name changes one setting of the agent or of the reward."""
 METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 
 
@@ -152,7 +175,8 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     """
     _known("method", method, METHODS)
     _known("preset", preset, PRESETS)
-    settings: dict[str, Any] = {**PRESETS[preset](task), **METHOD_SETTINGS[method, preset]}
+    own = METHOD_SETTINGS[method, preset]
+    settings: dict[str, Any] = {**PRESETS[preset](task), **(own(task) if callable(own) else own)}
     nested = {name: settings.pop(name) for name in list(settings) if "." in name}
     run = Run(task=task, method=method, preset=preset, **settings)
     if not run.reward.needs_demos:

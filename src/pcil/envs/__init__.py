@@ -151,7 +151,8 @@ def _suite_tasks() -> list[str]:
 def _refuse_name(task: str, error: Exception) -> NoReturn:
     suite = _suite_tasks()
     near = difflib.get_close_matches(task, [*TASKS, *gymnasium.registry, *suite], n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else "" if suite else " where DeepMind Control is not installed"
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    hint += "" if suite else " where DeepMind Control is not installed"
     raise InputError(
         f"There is no environment {task!r}{hint}: give one of {', '.join(TASKS)}, another task of DeepMind Control's "
         "suite, or any Gymnasium id."

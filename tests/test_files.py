@@ -16,7 +16,7 @@ import pytest
 
 import pcil
 from pcil import cli, files, loop, runs
-from pcil.errors import InputError
+from pcil.errors import InputError, shown
 from small import save_point_mass_demos, small_run
 
 HOLD = "import sys, time; from pathlib import Path; from pcil import files\nwith files.locked(Path(sys.argv[1])) as free:\n"
@@ -248,3 +248,44 @@ def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
     assert seen == ["False\n"]
     with files.locked(tmp_path / "run" / ".lock") as free:
         assert free
+
+
+# --- Text that is shown ---
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("walker_walk é 行", "walker_walk é 行"),
+        ("\x1b[31mred\x1b]0;title\x07", "\\x1b[31mred\\x1b]0;title\\x07"),
+        ("a\r\nb\tc\x00\x7f\x9b", "a\\r\\nb\\tc\\x00\\x7f\\x9b"),
+        ("lone \ud800", "lone \\ud800"),
+        ("right \u202e left", "right \\u202e left"),
+        ("x" * 5000, "x" * 750 + " ... " + "x" * 750),
+    ],
+    ids=["plain", "escapes", "controls", "surrogate", "direction", "long"],
+)
+def test_what_is_shown_is_printable_and_short(text: str, said: str) -> None:
+    assert shown(text) == said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "\x1b[31mred"],
+        ["train", "x" * 5000, "--out", "run"],
+        ["\x1b[2Jclear"],
+        ["evaluate", "\ud800"],
+        ["evaluate", "x" * 5000],
+        ["train", "toy/point_mass-v0", "--method", "expert", "--out", "x" * 5000],
+        ["train", "toy/point_mass-v0", "--method", "expert", "--out", "~no such user/run"],
+        ["report", "~no such user/run", "--out", "new"],
+        ["sweep", "\x1b[31m.toml", "--out", "~no such user/run"],
+        ["train", "toy/point_mass-v0", "--method", "\x1b[31mred", "--out", "run"],
+    ],
+    ids=lambda words: words[0][:8],
+)
+def test_hostile_arguments_are_one_short_printable_line(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("pcil: ") and err.endswith("\n") and err[:-1].isprintable() and len(err) < 1600

@@ -161,11 +161,13 @@ def test_where_an_atom_weighs_more_than_the_rest_off_s_the_cap_leaves_p_above_ni
 
 
 def test_an_expert_without_a_dominant_state_may_fall_below_the_sharper_bound() -> None:
-    """Uniform on three states, and a policy that is always in one of them: two thirds, where the bound would say three quarters."""
+    """Uniform on three states, and a policy that is always in one of them: 2/3, where the bound would say 3/4."""
     p, q = np.full(3, 1 / 3), np.array([0.0, 0.0, 1.0])
     value, phi = theory.attained(p, q)
     tv, mass = theory.total_variation(p, q), theory.expert_mass(p, q)
-    assert value / tv == pytest.approx(2 / 3, abs=SOLVED) and theory.certificate(p, q, phi) / tv == pytest.approx(2 / 3, abs=SOLVED)
+    assert value / tv == pytest.approx(2 / 3, abs=SOLVED) and theory.certificate(p, q, phi) / tv == pytest.approx(
+        2 / 3, abs=SOLVED
+    )
     assert theory.sharper_bound(mass) == pytest.approx(3 / 4)
 
 
@@ -180,7 +182,7 @@ def test_demonstrations_that_a_policy_never_meets_are_at_two_whatever_the_policy
 @given(PAIRS, st.integers(0, 99))
 def test_a_function_with_a_negative_mean_is_no_coordinate_along_v(pair: tuple[np.ndarray, np.ndarray], seed: int) -> None:
     """Off the axis the rest cancels, so v = (A, 0): with A below 0 it points the other way, and A is not its length."""
-    p, q = pair
+    p, _ = pair
     g = np.random.default_rng(seed).uniform(-1, 1, len(p))
     v = theory.halved(p) @ theory.halves_embedding(g)
     assert v == pytest.approx([g @ p, 0], abs=EXACT) and np.linalg.norm(v) == pytest.approx(abs(g @ p), abs=EXACT)

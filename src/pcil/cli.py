@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcil import arguments
-from pcil.errors import InputError
+from pcil.errors import InputError, shown
 
 if TYPE_CHECKING:
     from pcil.config import Run
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except InputError as error:
         sentence = " ".join(str(error).split())  # what a library said may have line breaks
-        print(f"pcil: {sentence.removesuffix('.')}.", file=sys.stderr)
+        print(f"pcil: {shown(sentence.removesuffix('.'))}.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
@@ -43,7 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         if error.filename is None and error.errno != errno.ENOSPC:
             raise
-        print(f"pcil: {error.filename or 'standard output'} can't be read or written ({error.strerror}).", file=sys.stderr)
+        where = shown(str(error.filename or "standard output"), 500)
+        print(f"pcil: {where} can't be read or written ({error.strerror}).", file=sys.stderr)
         return 2
 
 
@@ -140,7 +141,7 @@ def _evaluate(words: list[str]) -> int:
         if json_output:
             print(json.dumps(row))
         else:
-            print(f"{policy.task}: return {result.mean:.1f} +- {row['return_std']:.1f} over {episodes} episodes")
+            print(f"{shown(policy.task)}: return {result.mean:.1f} +- {row['return_std']:.1f} over {episodes} episodes")
             print("  " + "  ".join(f"{value:.1f}" for value in result.returns))
         return 0
 
@@ -202,7 +203,9 @@ def _record(words: list[str]) -> int:
             info=info,
         )
         path = recorded.save(out)
-        print(f"{episodes} episodes of {policy.task}, return {recorded.return_mean:.1f} +- {recorded.return_std:.1f}: {path}")
+        print(
+            f"{episodes} episodes of {shown(policy.task)}, return {recorded.return_mean:.1f} +- {recorded.return_std:.1f}: {path}"
+        )
         return 0
 
     return arguments.call("record", record, words)
@@ -263,10 +266,10 @@ def _sweep(words: list[str]) -> int:
             jobs: Runs at the same time; by default as many as there are cores for.
             address: A Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine, and stopped at the end.
         """
-        from pcil import progress, sweep
+        from pcil import files, progress, sweep
 
         _at_least(1, jobs=1 if jobs is None else jobs)
-        return sweep.sweep(file, out.expanduser(), jobs, address, progress.Screen(file=sys.stdout))
+        return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout))
 
     return arguments.call("sweep", sweep, words)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
+from typing import Any
 
 from pcil.errors import InputError
 
@@ -23,6 +24,7 @@ def start() -> None:
     """
     import jax
 
+    config: Any = jax.config
     failed: list[str] = []
 
     def heard(record: logging.LogRecord) -> bool:
@@ -37,14 +39,14 @@ def start() -> None:
     except Exception as error:  # JAX has no one type for it
         told = " ".join(str(error).split()).partition(" (set JAX_PLATFORMS")[0]
         reason = "; ".join(filter(None, [*failed, told])) or "there is no such device here"
-        setting = f" with JAX_PLATFORMS={asked}" if (asked := jax.config.jax_platforms) else ""
+        setting = f" with JAX_PLATFORMS={asked}" if (asked := config.jax_platforms) else ""
         raise InputError(
             f"JAX can't start{setting} ({reason[:300]}); unset JAX_PLATFORMS or set it to cpu, and for a GPU "
             "pip install '.[cuda]' in a clone."
         ) from error
     finally:
         logger.removeFilter(heard)
-    if failed and not jax.config.jax_platforms:
+    if failed and not config.jax_platforms:
         logger.warning("A plugin of JAX does not work here (%s); JAX computes on %s.", failed[0], devices[0].platform)
 
 

@@ -14,6 +14,13 @@ class InputError(Exception):
     """Something that a person gave is wrong. The command line prints it as one sentence and exits with code 2."""
 
 
+def shown(text: str, longest: int = 1500) -> str:
+    """Text for a terminal on one line: what is no printable character is escaped, and the middle of a long one left out."""
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    half = longest // 2
+    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+
+
 def check_ranges(settings: Any, **ranges: tuple[float | int, float | int]) -> None:
     """Each named field must be a number from the first to the second of its range, or `InputError` says which is not."""
     for name, (low, high) in ranges.items():

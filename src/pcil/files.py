@@ -47,6 +47,14 @@ def locked(path: Path) -> Iterator[bool]:
         lock.release()
 
 
+def expanded(path: Path) -> Path:
+    """The path with `~` as the user's home; `InputError` where nobody has that name."""
+    try:
+        return path.expanduser()
+    except RuntimeError as error:
+        raise InputError(f"{path} starts in the home of a user who is not known here; give the whole path.") from error
+
+
 def read_text(path: Path, limit: int = LARGEST) -> str:
     """The text of a regular file; `ValueError` where it is a pipe, a device or larger than so many bytes, `OSError` as ever."""
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # a pipe nobody writes to must not block

@@ -20,7 +20,7 @@ from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN, TaskReward
 def paper(task: str) -> dict[str, Any]:
     """What the paper's text says; where it is silent, what the authors' code does.
 
-    One sentence of the text is not followed: Appendix B gives the encoder "state s of a transition", and here, as in the authors'
+    One sentence of the text is not followed: Appendix B gives the encoder "state s of a transition". Here, as in the authors'
     code, a step is paid for the state that it leads to (docs/methods/pcil.md, point 14).
     """
     return {
@@ -127,7 +127,9 @@ def expert_as_released(task: str) -> dict[str, Any]:
     return {
         "frames": 1_100_000 if task in EASY else 3_100_000,  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
         "random_frames": 4000,  # DrQ-v2 cfgs/config.yaml: 2000 agent steps
-        "agent.noise": LinearSchedule(1.0, 0.1, 100_000 if task in EASY else 500_000),  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
+        "agent.noise": LinearSchedule(
+            1.0, 0.1, 100_000 if task in EASY else 500_000
+        ),  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
         "reward": TaskReward(),
     }
 
@@ -164,7 +166,7 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str
     ("expert", "released"): expert_as_released,
     ("expert", "default"): {"reward": TaskReward()},
 }
-"""What a method sets on top of a preset, for some on a task; a dotted name changes one setting of the agent or of the reward."""
+"""What a method sets on top of a preset, some by the task; a dotted name changes one setting of the agent or of the reward."""
 METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 
 

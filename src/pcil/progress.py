@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn,
 from rich.text import Text
 
 from pcil.config import Run
+from pcil.errors import shown
 from pcil.evaluate import Evaluation
 
 
@@ -137,7 +138,7 @@ class Bar:
 
     def say(self, text: str) -> None:
         """Print above the bar."""
-        self._progress.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._progress.console.print(shown(text), highlight=False, markup=False, soft_wrap=True)
 
     def stop(self) -> bool:
         """Whether a signal has asked to stop."""

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from pcil.errors import InputError
+from pcil.errors import InputError, shown
+from pcil.files import expanded
 
 
 def report(
@@ -27,15 +28,15 @@ def report(
         from pcil.report import load, page
     except ImportError as error:
         raise InputError(f"A report needs {error.name}, which pip install '.[report]' in a clone brings.") from error
-    found = load.collect([path.expanduser() for path in paths], _with_defaults)
-    page.clear(out := out.expanduser())
+    found = load.collect([expanded(path) for path in paths], _with_defaults)
+    page.clear(out := expanded(out))
     films: dict[str, bytes] = {}
     if rollouts and found.sources:
         from pcil import film, representation
 
         representation.add(found)
         films = film.films(found)
-    print("\n".join([*found.notes, f"Report: {page.build(found, out, films)}"]))
+    print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
     return 0
 
 

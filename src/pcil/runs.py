@@ -77,7 +77,7 @@ def train(
 def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
     compilation.use_cache()
-    folder, demos = folder.expanduser(), demonstrations(run)
+    folder, demos = files.expanded(folder), demonstrations(run)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():

@@ -23,7 +23,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from pcil import bench, files
-from pcil.errors import InputError
+from pcil.errors import InputError, shown
 from pcil.plans import Job, Plan, read
 from pcil.progress import Signals, time_left
 
@@ -44,7 +44,7 @@ def sweep(file: Path, out: Path, limit: int | None, address: str | None, console
     """Finish every run of a file, at most `limit` at a time; 1 where some failed, 130 or 143 where a signal stopped them."""
 
     def say(text: str) -> None:
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
+        console.print("\n".join(map(shown, text.split("\n"))), highlight=False, markup=False, soft_wrap=True)
 
     plan = read(file, out)
     left = sum(job.state != "done" for job in plan.jobs)

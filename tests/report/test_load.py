@@ -146,6 +146,21 @@ def test_where_no_value_is_the_usual_one_all_are_told(tmp_path: Path) -> None:
     assert {point.variant for point in collect([tmp_path]).points} == {"default, agent.gamma=0.9", "default, agent.gamma=0.99"}
 
 
+@pytest.mark.parametrize(
+    ("first", "second", "third", "longer"),
+    [(500, 1000, 500, "default, frames=1000"), (500, 1000, 2000, "default"), (500, 1000, 1000, "default")],
+)
+def test_a_budget_that_differs_on_one_task_makes_two_rows_of_a_method(
+    first: int, second: int, third: int, longer: str, tmp_path: Path
+) -> None:
+    """The most frequent goes without a name, else the longest; a task of one budget is never parted from the others."""
+    fake_run(tmp_path / "a", [1], "hopper_hop", frames=first)
+    fake_run(tmp_path / "b", [2], "hopper_hop", frames=second)
+    fake_run(tmp_path / "c", [3], "walker_run", frames=third)
+    by = {(point.task, point.return_mean): point.variant for point in collect([tmp_path]).points}
+    assert by["walker_run", 3] == "default" and by["hopper_hop", 2] == longer and len(set(by.values())) == 2
+
+
 def test_settings_that_a_run_lacks_may_be_completed(tmp_path: Path) -> None:
     for seed, agent in enumerate(({"gamma": 0.99}, {"gamma": 0.99, "novel": 0}, {"gamma": 0.99, "novel": 1})):
         fake_run(tmp_path / str(seed), [1], seed=seed, agent=agent)

@@ -203,9 +203,8 @@ def _record(words: list[str]) -> int:
             info=info,
         )
         path = recorded.save(out)
-        print(
-            f"{episodes} episodes of {shown(policy.task)}, return {recorded.return_mean:.1f} +- {recorded.return_std:.1f}: {path}"
-        )
+        returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
+        print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {path}")
         return 0
 
     return arguments.call("record", record, words)

@@ -131,6 +131,10 @@ def test_public_names_are_those_that_load() -> None:
         _ = pcil.nothing
 
 
+TEXT = {tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+"""Kinds of tokens that hold words of strings; from Python 3.12 on an f-string is several tokens."""
+
+
 def code_words(path: Path) -> Iterator[tuple[int, str]]:
     """Line and word of identifiers and strings; comments, docstrings and the package's own name in imports are left out."""
     tree = ast.parse(path.read_text())
@@ -140,7 +144,7 @@ def code_words(path: Path) -> Iterator[tuple[int, str]]:
     imports = {node.lineno for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)}
     for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
         line = token.start[0]
-        if token.type == tokenize.STRING and line not in docs | fields:
+        if token.type in TEXT and line not in docs | fields:
             yield from ((line, f"string {word}") for word in re.findall(r"[a-z]+", token.string.lower()))
         elif token.type == tokenize.NAME and not (token.string == "pcil" and line in imports):
             yield line, token.string.lower()

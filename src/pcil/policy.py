@@ -34,6 +34,11 @@ class Policy:
         obs_dim, action_dim = self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0]
         return Spec(obs_dim, action_dim, self.info.get("action_repeat", 1))
 
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of the environment that it was trained in."""
+        return self.info.get("env_kwargs", {})
+
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         obs = np.asarray(obs, np.float32)
         if obs.shape[-1:] != (self.spec.obs_dim,):

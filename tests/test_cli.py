@@ -390,7 +390,8 @@ def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) 
     rows = json.loads(capsys.readouterr().out)
     assert [row["task"] for row in rows] == shipped_tasks()
     for row in rows:
-        assert {"task", "episodes", "steps", "return_mean", "return_std", "expert", "hash"} <= set(row)
+        told = {"task", "episodes", "steps", "return_mean", "return_std", "return_min", "return_max", "expert", "hash"}
+        assert told <= set(row) and row["return_min"] <= row["return_mean"] <= row["return_max"]
         assert row["steps"] == 500 * row["episodes"] and len(row["hash"]) == 64
 
 
@@ -404,13 +405,15 @@ def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeyp
         "episodes": 3,
         "return_mean": 41.26,
         "return_std": 0.5,
+        "return_min": 40.7,
+        "return_max": 42.25,
         "steps": 9,
     }
     shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None, "hash": "0123456789abcdef"}
     monkeypatch.setattr("pcil.demos.shipped", lambda: [shown])
     assert cli.main(["demos"]) == 0
     out = capsys.readouterr().out
-    assert "me [/bold] [red]" in out and "41.3" in out and "01234567 " in out
+    assert "me [/bold] [red]" in out and re.search(r"41\.3 \+- 0\.5 +40\.7 +42\.2 ", out) and "01234567 " in out
 
 
 # --- Stopping ---

@@ -110,10 +110,23 @@ class Run:
         return Method(self.agent, self.reward, self.label)
 
     @property
+    def needs_actions(self) -> bool:
+        """Whether the actions of the demonstrations are read."""
+        return self.agent.offline or self.reward.needs_actions
+
+    @property
+    def needs_rewards(self) -> bool:
+        """Whether the rewards of the demonstrations are read: where the agent learns from demonstrated steps and the task's
+        reward counts."""
+        return self.reward.task_weight != 0 and (self.agent.offline or self.reward.prefill[0] > 0)
+
+    @property
     def plain(self) -> Run:
         """This run with every setting at its class's default: what an older `run.json`, written before a setting was there,
         says of it. So a new setting's default must be what the code did without it."""
-        kept = {name: getattr(self, name) for name in ("task", "label")}  # older than every run; not each reward takes each label
+        kept = {
+            name: getattr(self, name) for name in ("task", "label")
+        }  # older than every run; not each reward takes each label
         return _plain(self, **kept, agent=_plain(self.agent), reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:

@@ -124,6 +124,8 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
         raise ValueError("names and arrays do not fit")
     if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
         raise ValueError("its task is no name or its info no table")
+    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
+        raise ValueError("its env_kwargs are no table")
     width = trunk.weight.shape[1]
     if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
         raise ValueError("the trunk's shapes do not fit")

@@ -143,7 +143,8 @@ class Demonstrations:
 
         Observations and actions are written as float32, rewards as they are, and NaN for what is absent. Without
         `dataset_id`, the id is the path below the Minari root, or is made of the folder's name. The environment's
-        specification goes along if Gymnasium has it registered. `InputError` if something is there already or the place can not be written.
+        specification goes along if Gymnasium has it registered. `InputError` if something is there already or the place can
+        not be written.
         """
         self.validate(None)
         folder = free_folder(path)

@@ -34,7 +34,7 @@ def check_kinds(settings: Any) -> None:
 
 
 def json_object(name: str, value: Any) -> dict[str, Any]:
-    """`value`, a dict or the text of a JSON object, as JSON gives it back: tuples become lists. `InputError` if it is neither."""
+    """`value`, a dict or the text of a JSON object, as JSON gives it back: tuples become lists. Else `InputError`."""
     try:
         value = json.loads(value) if isinstance(value, str) else value
         if isinstance(value, dict) and all(isinstance(key, str) for key in value):

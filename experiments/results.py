@@ -57,8 +57,10 @@ def demos_table() -> str:
     rows = []
     for row in shipped():
         returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
-        rows.append((row["task"], row["observation_dim"], row["action_dim"], row["episodes"], returns, row["expert"]))
-    return tables.markdown(tables.Table(("task", "observation", "action", "episodes", "return", "expert"), rows))
+        bounds = f"{row['return_min']:.1f}", f"{row['return_max']:.1f}"
+        rows.append((row["task"], row["observation_dim"], row["action_dim"], row["episodes"], returns, *bounds, row["expert"]))
+    header = ("task", "observation", "action", "episodes", "return", "minimum", "maximum", "expert")
+    return tables.markdown(tables.Table(header, rows))
 
 
 if __name__ == "__main__":

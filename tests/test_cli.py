@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import html
 import io
 import json
@@ -12,7 +13,9 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -21,6 +24,7 @@ from pcil import arguments, cli, presets
 from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
 from pcil.envs.toy import PointMass
+from pcil.policy import load_policy
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
@@ -385,12 +389,50 @@ def test_a_report_without_rollouts_needs_files_alone(run: Path, tmp_path: Path, 
     assert not (tmp_path / "report" / "tables" / "transitions.csv").exists()
 
 
+def test_arguments_of_the_environment_go_with_the_policy(
+    trained: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What `evaluate` and `record` take from it, and what is given in place of that."""
+    run = load_policy(trained[0])
+    dataclasses.replace(run, info=run.info | {"env_kwargs": {"max_episode_steps": 7}}).save(tmp_path / "policy")
+    made: list[dict[str, Any]] = []
+    make = gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", lambda name, **kwargs: made.append(kwargs) or make(name, **kwargs))
+    for words in (["evaluate", "policy", "--episodes=1"], ["record", "policy", "--episodes=1", "--out"]):
+        for limit in (7, 9):
+            given = [] if limit == 7 else ["--env-kwargs", '{"max_episode_steps": 9}']
+            out = [f"out-{limit}"] if words[0] == "record" else []
+            assert cli.main([*words, *out, *given]) == 0
+            assert {kwargs["max_episode_steps"] for kwargs in made} == {limit}
+            made.clear()
+    assert Demonstrations.load("out-9").num_steps == 9 and Demonstrations.load("out-7").num_steps == 7
+    assert "env-kwargs '{\"max_episode_steps\": 9}'" in Demonstrations.load("out-9").info["command"]
+    capsys.readouterr()
+    assert "JSON object" in refused(["evaluate", "policy", "--env-kwargs", "[1]"], capsys)
+    assert "speed" in refused(["evaluate", "policy", "--env-kwargs", '{"speed": 1}'], capsys)
+
+
+def test_demonstrations_without_rewards_leave_the_expert_out_of_every_sentence(
+    demos: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = Demonstrations.load(demos)
+    states = Demonstrations.from_arrays([episode.obs for episode in whole.episodes], task=POINT_MASS).save(tmp_path / "states")
+    assert cli.main(narrow_run(str(states), "run")) == 0
+    said = capsys.readouterr().out
+    assert "Final return" in said and "expert" not in said and "nan" not in said and "None" not in said
+    assert cli.main(["report", "run", "--no-rollouts", "--out", "report"]) == 0
+    capsys.readouterr()
+    words = ["train", POINT_MASS, "--method", "bc", "--demos", str(states), "--frames", "300", "--out", "bc"]
+    assert "no actions, which bc" in refused(words, capsys)
+
+
 def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demos", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["task"] for row in rows] == shipped_tasks()
     for row in rows:
-        assert {"task", "episodes", "steps", "return_mean", "return_std", "expert", "hash"} <= set(row)
+        told = {"task", "episodes", "steps", "return_mean", "return_std", "return_min", "return_max", "expert", "hash"}
+        assert told <= set(row) and row["return_min"] <= row["return_mean"] <= row["return_max"]
         assert row["steps"] == 500 * row["episodes"] and len(row["hash"]) == 64
 
 
@@ -404,13 +446,15 @@ def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeyp
         "episodes": 3,
         "return_mean": 41.26,
         "return_std": 0.5,
+        "return_min": 40.7,
+        "return_max": 42.25,
         "steps": 9,
     }
     shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None, "hash": "0123456789abcdef"}
     monkeypatch.setattr("pcil.demos.shipped", lambda: [shown])
     assert cli.main(["demos"]) == 0
     out = capsys.readouterr().out
-    assert "me [/bold] [red]" in out and "41.3" in out and "01234567 " in out
+    assert "me [/bold] [red]" in out and re.search(r"41\.3 \+- 0\.5 +40\.7 +42\.2 ", out) and "01234567 " in out
 
 
 # --- Stopping ---

@@ -403,6 +403,8 @@ def test_the_table_of_what_ships_is_read_from_the_data(library: Path, monkeypatc
         "steps": 8,
         "return_mean": np.mean(original.returns),
         "return_std": np.std(original.returns),
+        "return_min": min(original.returns),
+        "return_max": max(original.returns),
         "expert": "test expert",
         "frames": 10,
         "seeds_tried": None,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import minari
 import numpy as np
 import pytest
 
 from pcil import demos, envs
-from pcil.evaluate import evaluate
 from pcil.policy import load_policy
 
 TASKS = demos.shipped_tasks()
+ROOT = Path(__file__).parent.parent
 POLICIES = demos.SHIPPED.parent / "policies"
 
 
@@ -46,11 +49,21 @@ def test_one_episode_replays_from_its_seed(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_policy_still_reaches_the_tables_return(task: str) -> None:
-    """Two episodes, each within four standard deviations (or 5% of the mean) of the demonstrations' mean."""
+    """Two episodes, kept by the same rule, each within four standard deviations (or 5% of the mean) of the demonstrations'."""
     shipped = demos.Demonstrations.load(task)
-    result = evaluate(load_policy(POLICIES / task), [envs.make(task) for _ in range(2)], seed=11)
+    rule, policy = shipped.info["record_minimum_return"], load_policy(POLICIES / task)
+    played = demos.record(policy, envs.make(task), 2, task=task, seed=11, minimum_return=rule, info={})
     tolerance = max(4 * shipped.return_std, 0.05 * shipped.return_mean)
-    assert np.abs(result.returns - shipped.return_mean).max() < tolerance
+    assert np.abs(played.returns - shipped.return_mean).max() < tolerance
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_no_shipped_episode_is_a_failed_one(task: str) -> None:
+    """By the rule of experiments/experts.toml, and none has less than half of the task's mean."""
+    rule = {"minimum_return": 100} | tomllib.loads((ROOT / "experiments" / "experts.toml").read_text())[task]
+    shipped = demos.Demonstrations.load(task)
+    assert shipped.returns.min() >= max(rule["minimum_return"], shipped.returns.mean() / 2)
+    assert shipped.info["record_minimum_return"] in (None, rule["minimum_return"])
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -25,8 +25,8 @@ LONGEST = 350
 LAYERS = [
     "errors types seeds files compilation",
     "losses transport optimiser networks noise theory",
-    "envs minari_files demos replay policy rewards agents",
-    "config presets evaluate checkpoint metrics learner loop runs progress",
+    "envs arrays minari_files demos replay policy rewards agents",
+    "config presets evaluate checkpoint metrics learner loop fit runs progress",
     "representation film reporting",
     "bench doctor arguments plans sweep cli",
 ]

@@ -97,6 +97,12 @@ def test_every_setting_reaches_its_run(demos: str) -> None:
     assert [job.name for job in jobs] == [f"{ARMS}/pcil/1", f"{ARMS}/pcil/2"]
 
 
+def test_arguments_of_the_environment_are_a_table_of_the_file() -> None:
+    text = "tasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1]\n[settings]\nenv_kwargs = {action_repeat = 4}\n"
+    text += "[variants.plain]\n[variants.slow]\nenv_kwargs.action_repeat = 8\n"
+    assert [job.run.env_kwargs for job in plan(text).jobs] == [{"action_repeat": 4}, {"action_repeat": 8}]
+
+
 def test_variants_multiply_and_one_with_a_method_of_its_own_stands_alone() -> None:
     text = "tasks = ['pendulum_swingup']\nmethods = ['pcil', 'dac']\nseeds = [1]\n[settings]\nagent.gamma = 0.9\n"
     text += "[variants.stored]\nlabel = 'stored'\nagent.gamma = 0.8\n[variants.oracle]\nmethod = 'expert'\npreset = 'paper'\n"

@@ -112,11 +112,14 @@ def _evaluate(words: list[str]) -> int:
 
     import tyro
 
+    from pcil.config import EnvKwargs
+
     def evaluate(
         folder: Path,
         /,
         episodes: int = 10,
         seed: int = 0,
+        env_kwargs: EnvKwargs | None = None,
         json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
     ) -> int:
         """Roll out the policy of a run, without exploration.
@@ -125,6 +128,7 @@ def _evaluate(words: list[str]) -> int:
             folder: A run's folder, or one that holds policy.json and policy.safetensors.
             episodes: How many.
             seed: The episodes' starts follow from it.
+            env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
             json_output: Print one JSON object and nothing else.
         """
         from pcil.evaluate import environments_for
@@ -134,8 +138,9 @@ def _evaluate(words: list[str]) -> int:
         _at_least(1, episodes=episodes)
         _at_least(0, seed=seed)
         policy = load_policy(folder)
+        arguments = policy.env_kwargs if env_kwargs is None else env_kwargs
         with contextlib.redirect_stdout(sys.stderr):  # an environment may print
-            result = roll_out(policy, environments_for(policy.task, episodes), seed=seed, episodes=episodes)
+            result = roll_out(policy, environments_for(policy.task, episodes, arguments), seed=seed, episodes=episodes)
         row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
         row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
         if json_output:
@@ -159,13 +164,10 @@ def _demos(words: list[str]) -> int:
         Args:
             json_output: Print one JSON list and nothing else.
         """
-        from pcil.demos import shipped
+        from pcil.demos import shipped, table
 
         rows = shipped()
-        if json_output:
-            print(json.dumps(rows))
-            return 0
-        print("\n".join(_demos_table(rows)))
+        print(json.dumps(rows) if json_output else "\n".join(table(rows)))
         return 0
 
     return arguments.call("demos", demos, words)
@@ -174,7 +176,17 @@ def _demos(words: list[str]) -> int:
 def _record(words: list[str]) -> int:
     """Record demonstrations from a trained policy."""
 
-    def record(folder: Path, /, out: Path, episodes: int = 10, seed: int = 0, minimum_return: float | None = None) -> int:
+    from pcil.config import EnvKwargs
+
+    def record(
+        folder: Path,
+        /,
+        out: Path,
+        episodes: int = 10,
+        seed: int = 0,
+        minimum_return: float | None = None,
+        env_kwargs: EnvKwargs | None = None,
+    ) -> int:
         """Record demonstrations from a trained policy, as a Minari dataset.
 
         Args:
@@ -183,6 +195,7 @@ def _record(words: list[str]) -> int:
             episodes: How many.
             seed: The episodes' starts follow from it.
             minimum_return: Keep only episodes of at least this return.
+            env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
         """
         from pcil import demos, envs
         from pcil.policy import load_policy
@@ -192,10 +205,12 @@ def _record(words: list[str]) -> int:
         _at_least(0, seed=seed)
         demos.free_folder(out)
         policy = load_policy(folder)
-        info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed} --out {out}")
+        least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
+        least += "" if env_kwargs is None else f" --env-kwargs '{json.dumps(env_kwargs)}'"
+        info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed}{least} --out {out}")
         recorded = demos.record(
             policy,
-            envs.make(policy.task),
+            envs.make(policy.task, env_kwargs=policy.env_kwargs if env_kwargs is None else env_kwargs),
             episodes,
             task=policy.task,
             seed=seed,
@@ -319,18 +334,6 @@ def _at_least(least: int, **options: int) -> None:
     for name, value in options.items():
         if value < least:
             raise InputError(f"--{name} is {value}; it must be at least {least}.")
-
-
-def _demos_table(rows: list[dict[str, Any]]) -> list[str]:
-    """One line a dataset, for people."""
-    sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
-    lines = [f"{'task':<18}{sizes}{'return':>15}{'tries':>6}  {'hash':<10}expert"]
-    for row in rows:
-        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}{row['steps']:>7}"
-        returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
-        tries = "" if row["seeds_tried"] is None else row["seeds_tried"]
-        lines.append(f"{row['task']:<18}{sizes}{returns:>15}{tries:>6}  {row['hash'][:8]:<10}{row['expert']}")
-    return lines
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

@@ -11,11 +11,22 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pcil.agents import Agent, DrQV2
-from pcil.errors import InputError, check_kinds, check_ranges
+from pcil.errors import InputError, check_kinds, check_ranges, json_object
 from pcil.rewards import PCIL, Reward
 
 MACHINE_SETTINGS = ("checkpoint_seconds",)
 """Settings that change no result, so a run may resume with others."""
+EnvKwargs = Annotated[
+    dict[str, Any],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="JSON",
+        instance_from_str=lambda words: json_object("--env-kwargs", words[0]),
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=lambda value: [json.dumps(value)],
+    ),
+]
+"""Keyword arguments of an environment; one word of JSON on the command line."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +48,8 @@ class Run:
     """Name of the method; it chooses the reward and its settings."""
     preset: str = "default"
     """default: what our measurements favour; paper: the paper's text; released: what the authors' code does."""
+    env_kwargs: EnvKwargs = field(default_factory=dict)
+    """Keyword arguments of the environment as a JSON object, such as '{"frame_skip": 5}'; they are given to gymnasium.make."""
     seed: int = 1
     """Everything random follows from it."""
     frames: int = 500_000
@@ -45,6 +58,11 @@ class Run:
     """A shipped task, the folder of a Minari dataset or the id of a local one; by default what ships for the task."""
     num_demos: int | None = None
     """Use only the first so many demonstrations."""
+    demos_mismatch: Literal["refuse", "scale", "keep"] = "refuse"
+    """Demonstrations of an environment with another action box, other arguments or another time step: refuse them, or use them
+    with actions scaled from the dataset's box to the environment's, or with the values of the actions kept as recorded."""
+    clip_actions: bool = False
+    """Clip demonstrated actions that are out of bounds, instead of refusing them."""
     label: Literal["sampled", "stored"] = "sampled"
     """When a step gets its learned reward: each time it is sampled (never stale), or once, when its episode is stored."""
     agent: Agent = field(default_factory=DrQV2)
@@ -68,6 +86,7 @@ class Run:
 
     def __post_init__(self) -> None:
         check_kinds(self)
+        object.__setattr__(self, "env_kwargs", json_object("env_kwargs", self.env_kwargs))
         if self.label == "sampled" and self.reward.scope == "episode":
             raise InputError(
                 f"{type(self.reward).__name__} needs whole episodes in order and can't label sampled steps; use --label stored."
@@ -91,10 +110,24 @@ class Run:
         return Method(self.agent, self.reward, self.label)
 
     @property
+    def needs_actions(self) -> bool:
+        """Whether the actions of the demonstrations are read."""
+        return self.agent.offline or self.reward.needs_actions
+
+    @property
+    def needs_rewards(self) -> bool:
+        """Whether the rewards of the demonstrations are read: where the agent learns from demonstrated steps and the task's
+        reward counts."""
+        return self.reward.task_weight != 0 and (self.agent.offline or self.reward.prefill[0] > 0)
+
+    @property
     def plain(self) -> Run:
-        """This run with agent and reward at the defaults of their classes: what an older `run.json`, written before a setting
-        was there, says of it. So a new setting's default must be what the code did without it."""
-        return dataclasses.replace(self, agent=_plain(self.agent), reward=_plain(self.reward))
+        """This run with every setting at its class's default: what an older `run.json`, written before a setting was there,
+        says of it. So a new setting's default must be what the code did without it."""
+        kept = {
+            name: getattr(self, name) for name in ("task", "label")
+        }  # older than every run; not each reward takes each label
+        return _plain(self, **kept, agent=_plain(self.agent), reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:
         """Every setting, nested, as JSON gives it back; agent and reward say their class."""
@@ -125,12 +158,12 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
     return dataclasses.replace(settings, **own)
 
 
-def _plain(settings: Any) -> Any:
-    """Settings at their class's defaults, where it has some."""
+def _plain(settings: Any, **kept: Any) -> Any:
+    """Settings at their class's defaults, where it has some, but for those that are `kept`."""
     fields = dataclasses.fields(settings)
     own = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
     own |= {field.name: field.default_factory() for field in fields if field.default_factory is not dataclasses.MISSING}
-    return dataclasses.replace(settings, **own)
+    return dataclasses.replace(settings, **(own | kept))
 
 
 def completed(old: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:

@@ -8,19 +8,19 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec, registry
 from jaxtyping import Float
 
-from pcil import seeds
+from pcil import envs, seeds
+from pcil.arrays import episodes_of
 from pcil.errors import InputError
-from pcil.minari_files import read, reason, task_of
-from pcil.types import Episode, Spec
+from pcil.minari_files import Stored, read, reason, task_of, write
+from pcil.types import Episode, Origin, Spec
 
 SHIPPED = Path(__file__).parent / "data" / "demos"  # a Minari root, so that plain Minari can load what ships
 ACTION_TOLERANCE = 1e-6  # how far rounding may carry an action out of [-1, 1]
@@ -32,26 +32,51 @@ class Demonstrations:
     """Whole episodes of an expert, with flat observations and with actions in [-1, 1].
 
     `task` is a shipped task's name ("walker_walk") or a Gymnasium id. `info` says where the episodes come from and must
-    be JSON; `shipped` shows its keys `expert` (one line: method, frames, seed), `frames` and `seeds_tried`.
+    be JSON; `shipped` shows its keys `expert` (one line: method, frames, seed), `frames` and `seeds_tried`. `origin` is what is
+    known of the environment. Without actions (`has_actions`) an episode has rows of no numbers in their place, without rewards
+    (`has_rewards`) zeros, and whatever asks for them raises `InputError`.
     """
 
     task: str
     episodes: tuple[Episode, ...]
     info: dict[str, Any]
+    origin: Origin = dataclasses.field(default_factory=Origin)
+    has_actions: bool = True
+    has_rewards: bool = True
 
     @classmethod
-    def load(cls, spec: str | Path) -> Demonstrations:
+    def from_arrays(
+        cls,
+        obs: Any,
+        actions: Any = None,
+        rewards: Any = None,
+        terminated: Any = None,
+        *,
+        task: str = "arrays",
+        info: dict[str, Any] | None = None,
+    ) -> Demonstrations:
+        """Demonstrations of lists with one array for each episode: `obs` [T+1, O], `actions` [T, A] in [-1, 1] (see `clip`),
+        `rewards` [T], and whether it `terminated`, True or False (by default none did). Without actions or rewards, methods
+        that read none can be trained. `InputError` names the array that does not fit."""
+        parts = episodes_of(obs, actions, rewards, terminated)
+        made = cls(task, parts, info or {}, has_actions=actions is not None, has_rewards=rewards is not None)
+        _check(made, "the arrays", bounded=False)
+        return made
+
+    @classmethod
+    def load(cls, spec: str | Path, *, bounded: bool = True) -> Demonstrations:
         """The demonstrations that `spec` names; `InputError` says what is wrong with it or with them.
 
         `spec` is, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the path of a
         Minari dataset folder (or of the `data` folder in it), the id of a dataset in the user's local Minari root.
         Dict observations are flattened as FlattenObservation does it, and actions are brought from the dataset's Box to
-        [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes its `info`.
+        [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes its `info`. Actions out of
+        bounds are refused; with `bounded=False` they stay, for `clip`.
         """
         data = _find(spec)
-        task, episodes, info = read(data)
-        _check(episodes, str(data))
-        return cls(task, tuple(episodes), info)
+        loaded = cls(*read(data))
+        _check(loaded, str(data), bounded=bounded)
+        return loaded
 
     @property
     def num_steps(self) -> int:
@@ -61,17 +86,19 @@ class Demonstrations:
     @property
     def returns(self) -> Float[np.ndarray, " episodes"]:
         """The undiscounted sum of the environment's rewards, for each episode, in float64."""
+        self._must_have("rewards")
         return np.array([episode.total_reward for episode in self.episodes], np.float64)
 
     @property
-    def return_mean(self) -> float:
-        """The mean return of an episode."""
-        return float(self.returns.mean())
+    def return_mean(self) -> float | None:
+        """The mean return of an episode; None without rewards."""
+        return float(self.returns.mean()) if self.has_rewards else None
 
     @property
-    def return_std(self) -> float:
-        """The population standard deviation of the returns (divided by the number of episodes; 0 for one episode)."""
-        return float(self.returns.std())
+    def return_std(self) -> float | None:
+        """The population standard deviation of the returns (divided by the number of episodes; 0 for one episode); None
+        without rewards."""
+        return float(self.returns.std()) if self.has_rewards else None
 
     @property
     def obs(self) -> Float[np.ndarray, "N O"]:
@@ -81,12 +108,13 @@ class Demonstrations:
     @property
     def action(self) -> Float[np.ndarray, "N A"]:
         """The actions taken in `obs`, row by row, in a new array."""
+        self._must_have("actions")
         return np.concatenate([episode.action for episode in self.episodes])
 
     @property
     def hash(self) -> str:
         """Hexadecimal SHA-256 of the observations, actions, rewards and terminations; saving and loading keep it."""
-        digest = hashlib.sha256()
+        digest = hashlib.sha256(" ".join(self._absent).encode())
         for episode in self.episodes:
             for array, dtype in ((episode.obs, "<f4"), (episode.action, "<f4"), (episode.reward, "<f8")):
                 digest.update(f"{array.shape} {bool(episode.terminated)}".encode() + array.astype(dtype).tobytes())
@@ -95,8 +123,13 @@ class Demonstrations:
     def validate(self, spec: Spec | None) -> Demonstrations:
         """These demonstrations; `InputError` if there are none, if values are not finite, if actions leave [-1, 1], or
         if shapes differ from those of the environment's `spec` (from the first episode's, if that is None)."""
-        _check(self.episodes, f"the demonstrations of {self.task}", spec)
+        _check(self, f"the demonstrations of {self.task}", spec)
         return self
+
+    def clip(self) -> Demonstrations:
+        """These demonstrations with each entry of an action clipped to [-1, 1]."""
+        parts = (dataclasses.replace(episode, action=np.clip(episode.action, -1, 1)) for episode in self.episodes)
+        return dataclasses.replace(self, episodes=tuple(parts))
 
     def take(self, n: int | None) -> Demonstrations:
         """The first `n` episodes; all of them if `n` is None. `InputError` if there are not as many, or `n` < 1."""
@@ -108,9 +141,10 @@ class Demonstrations:
     def save(self, path: str | Path, *, dataset_id: str | None = None) -> Path:
         """Write a Minari dataset folder at `path`, whole or not at all, and return its absolute path.
 
-        Observations and actions are written as float32, rewards as they are. Without `dataset_id`, the id is the path
-        below the Minari root, or is made of the folder's name. The environment's specification goes along if
-        Gymnasium has it registered. `InputError` if something is there already or the place can not be written.
+        Observations and actions are written as float32, rewards as they are, and NaN for what is absent. Without
+        `dataset_id`, the id is the path below the Minari root, or is made of the folder's name. The environment's
+        specification goes along if Gymnasium has it registered. `InputError` if something is there already or the place can
+        not be written.
         """
         self.validate(None)
         folder = free_folder(path)
@@ -121,7 +155,8 @@ class Demonstrations:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
                 unfinished = Path(scratch) / "dataset"
-                self._write(unfinished / "data", dataset_id)
+                kept = (getattr(self, name) for name in Stored._fields)
+                write(unfinished / "data", dataset_id, Stored(*kept))
                 unfinished.rename(folder)
         except (OSError, TypeError, ValueError) as error:
             raise InputError(
@@ -129,31 +164,13 @@ class Demonstrations:
             ) from error
         return folder
 
-    def _write(self, data: Path, dataset_id: str) -> None:
-        """Write `metadata.json` and `main_data.hdf5` into the new folder `data`, by Minari's own hand."""
-        import minari
-        from minari.data_collector import EpisodeBuffer
-        from minari.dataset.minari_storage import MinariStorage
+    @property
+    def _absent(self) -> list[str]:
+        return [name for name in ("actions", "rewards") if not getattr(self, f"has_{name}")]
 
-        data.mkdir(parents=True)
-        box, first = gymnasium.spaces.Box, self.episodes[0]
-        observation_space = box(-np.inf, np.inf, first.obs.shape[1:], np.float32)
-        action_space = box(-1.0, 1.0, first.action.shape[1:], np.float32)
-        storage = MinariStorage.new(data, observation_space, action_space, _env_spec(self.task))
-        known = {"dataset_id": dataset_id, "minari_version": minari.__version__}
-        described = {"description": f"Demonstrations of {self.task} by {self.info.get('expert', 'an unknown expert')}."}
-        storage.update_metadata(known | described | {"pcil": {"task": self.task, "info": self.info}})
-        for episode in self.episodes:
-            last = np.arange(len(episode)) == len(episode) - 1
-            buffer = EpisodeBuffer(
-                seed=episode.seed,
-                observations=list(episode.obs.astype(np.float32)),
-                actions=list(episode.action.astype(np.float32)),
-                rewards=list(episode.reward),
-                terminations=list(last & episode.terminated),
-                truncations=list(last & (not episode.terminated)),
-            )
-            storage.update_episodes([buffer])
+    def _must_have(self, name: str) -> None:
+        if name in self._absent:
+            raise InputError(f"The demonstrations of {self.task} have no {name}.")
 
 
 def free_folder(path: str | Path) -> Path:
@@ -179,8 +196,9 @@ def record(
 ) -> Demonstrations:
     """`episodes` episodes of `policy`, a function of the arguments alone: attempt k is reset with the k-th seed.
 
-    `policy` maps an observation [O] in float32 to an action [A] in [-1, 1]. Episodes that return less than
-    `minimum_return` are dropped and tried again with the next seed. `info` is kept; `record_*` keys are added to it.
+    `policy` maps an observation [O] in float32 to an action [A] within the bounds of `env`, which are brought to [-1, 1] in
+    what is kept. Episodes that return less than `minimum_return` are dropped and tried again with the next seed. `info` is
+    kept; `record_*` keys are added to it.
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for, but at least 1 must be recorded.")
@@ -190,10 +208,10 @@ def record(
     for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
         episode = _rollout(policy, env, seeds.episode_seed(seed, seeds.Stream.RECORD, attempt))
         if minimum_return is None or episode.total_reward >= minimum_return:
-            kept.append(episode)
+            kept.append(_in_unit_box(episode, env.action_space))
         if len(kept) == episodes:
             made = {"record_seed": seed, "record_attempts": attempt + 1, "record_minimum_return": minimum_return}
-            return Demonstrations(task, tuple(kept), info | made).validate(None)
+            return Demonstrations(task, tuple(kept), info | made, envs.origin(env)).validate(None)
     raise InputError(
         f"Only {len(kept)} of {limit} episodes of {task} returned at least {minimum_return}, but {episodes} were "
         f"asked for: lower the minimum return or record a better policy."
@@ -211,6 +229,17 @@ def _rollout(policy: Callable[[np.ndarray], Any], env: gymnasium.Env, seed: int)
     return Episode(np.stack(observations), np.stack(actions), np.array(rewards), bool(terminated), seed)
 
 
+def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:
+    """The episode with actions brought from their bounds to [-1, 1]."""
+    if not isinstance(space, gymnasium.spaces.Box) or not space.is_bounded():
+        raise InputError(f"Demonstrations need actions in a Box with finite bounds; those of the environment are {space}.")
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    if (low == -1).all() and (high == 1).all():
+        return episode
+    action = (episode.action - (high + low) / 2) / ((high - low) / 2)
+    return dataclasses.replace(episode, action=action.astype(np.float32))
+
+
 def shipped_tasks() -> list[str]:
     """The names of the tasks whose demonstrations lie in the package."""
     return sorted(path.parents[2].name for path in SHIPPED.glob("dmc/*/expert-v0/data/metadata.json"))
@@ -223,17 +252,40 @@ def shipped() -> list[dict[str, Any]]:
         dims = {"observation_dim": demos.obs.shape[1], "action_dim": demos.action.shape[1]}
         counts = {"episodes": len(demos.episodes), "steps": demos.num_steps}
         returns = {"return_mean": demos.return_mean, "return_std": demos.return_std}
+        returns |= {"return_min": float(demos.returns.min()), "return_max": float(demos.returns.max())}
         told = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
         rows.append({"task": demos.task, **dims, **counts, **returns, **told, "hash": demos.hash})
     return rows
 
 
-def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -> None:
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """The rows of `shipped`, one line a dataset, for people."""
+    sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
+    lines = [f"{'task':<18}{sizes}{'return':>15}{'min':>7}{'max':>7}{'tries':>6}  {'hash':<10}expert"]
+    for row in rows:
+        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}{row['steps']:>7}"
+        returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
+        returns = f"{returns:>15}{row['return_min']:>7.1f}{row['return_max']:>7.1f}"
+        tries = "" if row["seeds_tried"] is None else row["seeds_tried"]
+        lines.append(f"{row['task']:<18}{sizes}{returns}{tries:>6}  {row['hash'][:8]:<10}{row['expert']}")
+    return lines
+
+
+def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, bounded: bool = True) -> None:
     """Refuse what `Demonstrations.validate` says, naming `source`."""
+    episodes = demos.episodes
     if not episodes:
         raise InputError(f"There are no episodes in {source}, but at least one is needed.")
     first = episodes[0]
+    if (
+        min(first.obs.ndim, first.action.ndim) < 2
+        or not first.obs.shape[1]
+        or (demos.has_actions and not first.action.shape[1])
+    ):
+        shapes = f"observations of shape {first.obs.shape} and actions of shape {first.action.shape}"
+        raise InputError(f"Episode 0 of {source} has {shapes}; each must be rows of at least one number.")
     obs_dim, action_dim = (spec.obs_dim, spec.action_dim) if spec else (first.obs.shape[-1], first.action.shape[-1])
+    action_dim = action_dim if demos.has_actions else first.action.shape[-1]
     for index, episode in enumerate(episodes):
         where, steps = f"Episode {index} of {source}", len(episode)
         for name, shape in (("obs", (steps + 1, obs_dim)), ("action", (steps, action_dim)), ("reward", (steps,))):
@@ -243,9 +295,13 @@ def _check(episodes: Sequence[Episode], source: str, spec: Spec | None = None) -
                 raise InputError(f"{where} has {name} of shape {array.shape}, but {whose} it must be {shape}.")
             if not np.isfinite(array).all():
                 raise InputError(f"{where} has NaN or infinite values in {name}, but all must be finite.")
-        low, high = float(episode.action.min()), float(episode.action.max())
-        if max(-low, high) > 1 + ACTION_TOLERANCE:
-            raise InputError(f"{where} has actions from {low:.7g} to {high:.7g}, but their bounds are [-1, 1].")
+        low, high = (float(f(episode.action, initial=0)) for f in (np.min, np.max))
+        if bounded and max(-low, high) > 1 + ACTION_TOLERANCE:
+            low, high = float(episode.action.min()), float(episode.action.max())
+            raise InputError(
+                f"{where} has actions from {low:.7g} to {high:.7g}, but their bounds are [-1, 1]; --clip-actions True (or "
+                "Demonstrations.clip in Python) clips them."
+            )
 
 
 def _find(spec: str | Path) -> Path:
@@ -263,18 +319,6 @@ def _find(spec: str | Path) -> Path:
         f"There is no Minari dataset (a folder with data/metadata.json) {str(spec)!r}: give a shipped task "
         f"({', '.join(names) or 'none ship'}), the path of such a folder, or an id below {_minari_root()}."
     )
-
-
-def _env_spec(task: str) -> EnvSpec | None:
-    """What Gymnasium has registered for `task`, with the wrappers that make it flat and its actions [-1, 1]."""
-    known = next((registry[name] for name in (f"dmc/{task}-v0", task.rpartition(":")[2]) if name in registry), None)
-    if known is None or not isinstance(known.entry_point, str):
-        return None
-    if known.namespace in ("dmc", "toy"):  # these are so by themselves
-        return known
-    flatten = gymnasium.wrappers.FlattenObservation.wrapper_spec()
-    rescale = gymnasium.wrappers.RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0)
-    return dataclasses.replace(known, additional_wrappers=(flatten, rescale))
 
 
 def _minari_root() -> Path:

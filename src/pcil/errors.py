@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import numbers
 import types
@@ -37,6 +38,19 @@ def check_kinds(settings: Any) -> None:
         value, hint = getattr(settings, field.name), hints[field.name]
         if not _fits(value, hint):
             raise InputError(f"{type(settings).__name__}.{field.name} is {value!r}; it must be {_described(hint)}.")
+
+
+def json_object(name: str, value: Any) -> dict[str, Any]:
+    """`value`, a dict or the text of a JSON object, as JSON gives it back: tuples become lists. Else `InputError`."""
+    try:
+        value = json.loads(value) if isinstance(value, str) else value
+        if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+            return json.loads(json.dumps(value, allow_nan=False))
+    except (ValueError, TypeError, RecursionError):
+        pass
+    given = repr(value)
+    given = given if len(given) <= 80 else f"{given[:80]}..."
+    raise InputError(f'{name} is {given}; it must be a JSON object such as {{"frame_skip": 5}}.')
 
 
 def _fits(value: Any, hint: Any) -> bool:

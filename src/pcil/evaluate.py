@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -33,9 +34,9 @@ class Evaluation:
         return float(np.mean(self.returns))
 
 
-def environments_for(task: str, episodes: int) -> list[gymnasium.Env]:
+def environments_for(task: str, episodes: int, env_kwargs: dict[str, Any] | None = None) -> list[gymnasium.Env]:
     """What `evaluate` plays so many episodes in: one each, but not more than `LOCKSTEP`, for each takes memory."""
-    return [envs.make(task) for _ in range(min(episodes, LOCKSTEP))]
+    return [envs.make(task, env_kwargs=env_kwargs) for _ in range(min(episodes, LOCKSTEP))]
 
 
 def evaluate(

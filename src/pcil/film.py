@@ -33,7 +33,7 @@ def film(folder: Path, steps: int = 160, every: int = 4) -> bytes:
     from PIL import Image
 
     policy = load_policy(folder)
-    env = envs.make(policy.task, render_mode="rgb_array")
+    env = envs.make(policy.task, render_mode="rgb_array", env_kwargs=policy.env_kwargs)
     obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
     frames, over = [], False
     while not over and len(frames) * every < steps:

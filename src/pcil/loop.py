@@ -80,9 +80,9 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
     An offline agent has passes of `OFFLINE_STEPS` updates instead. `demos` may be empty where nothing needs them. Returns the
     final state, with the final return in its counters. Raises `Stopped` where the reporter asks for it.
     """
-    env = envs.make(run.task)
+    env = envs.make(run.task, env_kwargs=run.env_kwargs)
     spec = envs.spec(env)
-    rollout = environments_for(run.task, run.evaluate_episodes)
+    rollout = environments_for(run.task, run.evaluate_episodes, run.env_kwargs)
     state, positions = resume(run, folder, start(run, spec, demos), reporter)
     clock = _Clock(state.counters.seconds)
     saved = clock.total()
@@ -240,6 +240,7 @@ def _evaluate(
         "frames": state.counters.frames,
         "return_mean": result.mean,
         "action_repeat": envs.spec(rollout[0]).action_repeat,
+        "env_kwargs": run.env_kwargs,
     }
     Policy(host, envs.task_name(run.task), info).save(folder / "policy")
     reporter.evaluation(run, state.counters.frames, result)

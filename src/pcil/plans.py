@@ -134,9 +134,12 @@ def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, li
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as dotted names: in TOML a dotted name without quotes is a nested table."""
+    """Nested tables as dotted names: in TOML a dotted name without quotes is a nested table. An environment's arguments are one
+    value, in JSON."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
+        if prefix + key in ("env_kwargs", "env-kwargs") and isinstance(value, dict):
+            value = json.dumps(value, default=str)
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return flat
 

@@ -35,6 +35,11 @@ class Policy:
         obs_dim, action_dim = self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0]
         return Spec(obs_dim, action_dim, self.info.get("action_repeat", 1))
 
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of the environment that it was trained in."""
+        return self.info.get("env_kwargs", {})
+
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         obs = np.asarray(obs, np.float32)
         if obs.shape[-1:] != (self.spec.obs_dim,):
@@ -120,6 +125,8 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
         raise ValueError("names and arrays do not fit")
     if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
         raise ValueError("its task is no name or its info no table")
+    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
+        raise ValueError("its env_kwargs are no table")
     width = trunk.weight.shape[1]
     if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
         raise ValueError("the trunk's shapes do not fit")

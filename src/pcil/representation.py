@@ -50,7 +50,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     run = restored(source.settings)
     if type(run.reward).representation is Reward.representation:
         return []
-    demos, env = runs.demonstrations(run), envs.make(run.task)
+    demos, env = runs.demonstrations(run), envs.make(run.task, env_kwargs=run.env_kwargs)
     assert demos is not None
     state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
     if not state.counters.episodes:

@@ -8,13 +8,13 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from pcil import compilation, envs, files, loop, presets
+from pcil import compilation, envs, files, fit, loop, presets
 from pcil.config import Run, completed, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
@@ -32,7 +32,7 @@ class Result:
     final_return: float
     """Mean return of the last evaluation."""
     demos_return: float | None
-    """Mean return of the demonstrations, where there were any."""
+    """Mean return of the demonstrations, where there were any with rewards."""
 
     @property
     def policy(self) -> Policy:
@@ -77,7 +77,7 @@ def train(
 def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
     compilation.use_cache()
-    folder, demos = files.expanded(folder), demonstrations(run)
+    folder, demos = files.expanded(folder), demonstrations(run, reporter.say)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
@@ -96,9 +96,10 @@ def read_done(folder: Path) -> float:
         ) from error
 
 
-def demonstrations(run: Run) -> Demonstrations | None:
-    """What the run imitates, checked against its environment, or None where it needs no demonstrations."""
-    environment = envs.make(run.task)
+def demonstrations(run: Run, say: Callable[[str], None] = lambda text: None) -> Demonstrations | None:
+    """What the run imitates, checked against its environment, or None where it needs no demonstrations; `say` is told what a
+    person should know of them."""
+    environment = envs.make(run.task, env_kwargs=run.env_kwargs)
     limit = environment.spec and environment.spec.max_episode_steps
     if limit and limit >= run.replay_steps:
         raise InputError(
@@ -107,7 +108,7 @@ def demonstrations(run: Run) -> Demonstrations | None:
     if not run.reward.needs_demos and not run.agent.offline:
         return None
     source = run.task if run.demos is None else run.demos
-    demos = Demonstrations.load(source).take(run.num_demos).validate(envs.spec(environment))
+    demos = fit.fitted(run, Demonstrations.load(source, bounded=False).take(run.num_demos), environment, say)
     steps = max(run.reward.span if run.reward.batch_size else 1, run.agent.n_step if run.agent.offline else 1)
     if all(len(episode) < steps and not episode.terminated for episode in demos.episodes):
         raise InputError(

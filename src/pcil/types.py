@@ -20,6 +20,23 @@ class Spec(NamedTuple):
     """Control steps (frames) for each agent step."""
 
 
+class Origin(NamedTuple):
+    """What is known of the environment that demonstrations were recorded in; None where nothing is known."""
+
+    env_id: str | None = None
+    """Its Gymnasium id."""
+    entry_point: str | None = None
+    """Its code, as Gymnasium has it registered."""
+    kwargs: dict[str, Any] | None = None
+    """The keyword arguments it was made with, those of its registration among them."""
+    action_low: list[float] | None = None
+    """Lower bounds of the actions as the environment takes them; -1 in the demonstrations stands for these."""
+    action_high: list[float] | None = None
+    """Upper bounds; 1 stands for these."""
+    step_seconds: float | None = None
+    """Simulated time of one step."""
+
+
 class Batch(NamedTuple):
     """States and the actions taken in them, row by row: `obs[i]` is where `action[i]` was taken."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import json
 import warnings
 from typing import Any, NoReturn
 
@@ -10,8 +12,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces, wrappers
 
-from pcil.errors import InputError
-from pcil.types import Spec
+from pcil.errors import InputError, json_object
+from pcil.types import Origin, Spec
 
 __all__ = ["TASKS", "make", "register", "spec", "task_name"]
 
@@ -66,20 +68,24 @@ def task_name(task: str) -> str:
     return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
 
 
-def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
+def make(task: str, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> gymnasium.Env:
     """The environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
 
     `task` is a task of DeepMind Control's suite ("walker_walk" or "dmc/walker_walk-v0"), one of our toys
     ("toy/point_mass-v0") or any Gymnasium id whose spaces are boxes; those are flattened and rescaled with Gymnasium's
-    own wrappers.
+    own wrappers. `env_kwargs` are keyword arguments of the environment, given to `gymnasium.make`.
     """
     register()
+    arguments = json_object("env_kwargs", env_kwargs or {})
     env_id = _gymnasium_id(task)
     if render_mode is not None and env_id in _TOYS:
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
-    render: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+    if "task" in arguments and env_id.startswith("dmc/"):
+        raise InputError(f"env_kwargs has the task {arguments['task']!r}; the task is {task!r}, and arguments can't change it.")
+    if render_mode is not None:
+        arguments["render_mode"] = render_mode
     try:
-        env = gymnasium.make(env_id, disable_env_checker=True, **render)
+        env = gymnasium.make(env_id, disable_env_checker=True, **arguments)
     except InputError as error:
         raise InputError(f"The environment {task!r} can't be made: {error}") from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
@@ -89,7 +95,8 @@ def make(task: str, render_mode: str | None = None) -> gymnasium.Env:
             _refuse_name(task, error)
         raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
     except Exception as error:  # the environment may be a person's own and may raise anything
-        raise InputError(f"The environment {task!r} can't be made ({type(error).__name__}: {error}).") from error
+        given = f" with {json.dumps(env_kwargs)}" if env_kwargs else ""
+        raise InputError(f"The environment {task!r} can't be made{given} ({type(error).__name__}: {error}).") from error
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
         env = _flat_actions(_flat_observations(env, task), task)
@@ -125,6 +132,35 @@ def spec(env: gymnasium.Env) -> Spec:
     inner = env.unwrapped
     action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
     return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
+
+
+def origin(env: gymnasium.Env) -> Origin:
+    """What demonstrations recorded in `env` are to know of it."""
+    inner, outer = env.unwrapped, env
+    while isinstance(outer, gymnasium.Wrapper) and not isinstance(outer, _RescaleAction):
+        outer = outer.env
+    box = outer.env.action_space if isinstance(outer, _RescaleAction) else env.action_space
+    seconds = getattr(inner, "dt", None)
+    known = Origin(step_seconds=float(seconds) if isinstance(seconds, float | int) else None)
+    if isinstance(box, spaces.Box):
+        known = known._replace(action_low=box.low.ravel().tolist(), action_high=box.high.ravel().tolist())
+    if inner.spec is None:
+        return known
+    entry_point = inner.spec.entry_point if isinstance(inner.spec.entry_point, str) else None
+    return known._replace(env_id=inner.spec.id, entry_point=entry_point, kwargs=known_arguments(inner.spec.kwargs))
+
+
+def known_arguments(kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Those of an environment's keyword arguments that JSON can hold, without the way it is rendered."""
+    known = {}
+    for name, value in kwargs.items():
+        with contextlib.suppress(InputError):
+            known |= json_object(name, {name: value}) if name != "render_mode" else {}
+    return known
+
+
+class _RescaleAction(wrappers.RescaleAction):
+    """Ours, in contrast to one that the environment is registered with."""
 
 
 def _gymnasium_id(task: str) -> str:
@@ -180,7 +216,7 @@ def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
     dtype = space.dtype
     if np.any(space.low != -1.0) or np.any(space.high != 1.0):
         one = np.ones(space.shape, dtype)
-        env = wrappers.RescaleAction(env, -one, one)
+        env = _RescaleAction(env, -one, one)
     if dtype != np.float32:
         box = spaces.Box(-1.0, 1.0, space.shape, np.float32)
         env = wrappers.TransformAction(env, lambda action: np.asarray(action, dtype), box)

@@ -51,8 +51,8 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         height: int = 240,
         camera_id: int | str = 0,
     ) -> None:
-        if action_repeat < 1:
-            raise InputError(f"action_repeat is a number of control steps of at least 1; got {action_repeat}.")
+        if not isinstance(action_repeat, int) or action_repeat < 1:
+            raise InputError(f"action_repeat is a whole number of control steps of at least 1; got {action_repeat!r}.")
         if render_mode not in (None, "rgb_array"):
             raise InputError(f'render_mode is None or "rgb_array" for DeepMind Control; got {render_mode!r}.')
         suite = import_suite()
@@ -69,6 +69,11 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._random_model = random.bytes(16) != np.random.RandomState(0).bytes(16)
         self._define_spaces()
         self._frames, self._over = 0, True
+
+    @property
+    def dt(self) -> float:
+        """Simulated seconds of one step."""
+        return self._env.control_timestep() * self.action_repeat
 
     @property
     def physics(self) -> Any:
@@ -145,8 +150,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         # As dm_control's action_scale.Wrapper(env, -1, 1) has it; where the bounds are [-1, 1] nothing is to be scaled.
         self._action_low, self._action_scale = bounds.minimum, (bounds.maximum - bounds.minimum) / 2.0
         self._rescale = bool(np.any(bounds.minimum != -1.0) or np.any(bounds.maximum != 1.0))
-        fps = 1.0 / (self._env.control_timestep() * self.action_repeat)
-        self.metadata = {**DMCEnv.metadata, "render_fps": round(fps)}
+        self.metadata = {**DMCEnv.metadata, "render_fps": round(1.0 / self.dt)}
 
     def _observation(self) -> np.ndarray:
         row = np.empty(self._obs_dim, np.float32)

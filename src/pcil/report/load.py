@@ -191,10 +191,11 @@ def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
+    """Nested settings by their dotted names; an environment's arguments are one value."""
     values = {}
     for name, value in settings.items():
-        values |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+        nested = isinstance(value, dict) and name != "env_kwargs"
+        values |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
     return values
 
 

@@ -67,6 +67,15 @@ class Reward(abc.ABC):
         return "next_obs"
 
     @property
+    def needs_actions(self) -> bool:
+        """Whether actions of demonstrations are read: by a reward of state-action pairs, or where the replay begins with them.
+
+        A reward that reads them in another way overrides this; where it is False, demonstrations may have no actions, and those
+        that it is given are 0.
+        """
+        return self.reads == "obs" or self.prefill[0] > 0
+
+    @property
     def features(self) -> Literal["critic", "actor"]:
         """Whose trunk `embed` is."""
         return "critic"

@@ -136,7 +136,7 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
     ("tcn-gail", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4, head="gail")},  # as tcn
     ("bc", "paper"): {**BC_SETTINGS, "agent": BC()},  # authors' agent/bc.py; width of the paper's Table
     ("bc", "released"): {**BC_SETTINGS, "agent": BC(hidden=1024)},  # authors' agent/bc.py, dmc.yaml
-    ("bc", "default"): {**BC_SETTINGS, "agent": BC()},  # as paper
+    ("bc", "default"): {**BC_SETTINGS, "agent": BC(standardise=True)},  # as paper; scaled observations: ours
     ("expert", "paper"): {"reward": TaskReward()},
     ("expert", "released"): {"reward": TaskReward()},
     ("expert", "default"): {"reward": TaskReward()},

@@ -94,7 +94,8 @@ class Run:
     def plain(self) -> Run:
         """This run with agent and reward at the defaults of their classes: what an older `run.json`, written before a setting
         was there, says of it. So a new setting's default must be what the code did without it."""
-        return dataclasses.replace(self, agent=_plain(self.agent), reward=_plain(self.reward))
+        agent = dataclasses.replace(_plain(self.agent), absorbing=False)  # None is decided before `run.json` is written
+        return dataclasses.replace(self, agent=agent, reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:
         """Every setting, nested, as JSON gives it back; agent and reward say their class."""

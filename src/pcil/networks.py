@@ -20,6 +20,8 @@ SCALER_RATE = 1e-3
 """Least share of a new batch in the running statistics of observations."""
 SCALER_FLOOR = 1e-6
 """Least standard deviation that an entry is divided by, as a share of its mean: the mean itself has no more digits."""
+LEAST_DEVIATION = 1e-20
+"""Of an entry that is always 0: small beside any unit, and no division by it overflows."""
 SCALED_BOUND = 10.0
 """Scaled observations are clipped to this many standard deviations."""
 
@@ -138,9 +140,9 @@ class Scaler(eqx.Module):
 
     @property
     def normalizer(self) -> Normalizer:
-        """What observations are scaled by now; an entry that has always been 0 keeps its own units."""
+        """What observations are scaled by now; an entry that has never varied is 0 there and at the bound elsewhere."""
         deviation = jnp.sqrt(self.variance + (SCALER_FLOOR * self.mean) ** 2)
-        return Normalizer(self.mean, jnp.where(deviation > 0, deviation, 1.0))
+        return Normalizer(self.mean, jnp.maximum(deviation, LEAST_DEVIATION))
 
 
 def scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:

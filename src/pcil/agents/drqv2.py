@@ -139,4 +139,3 @@ class DrQV2(Agent):
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
         noise = normal_steps(rng, action_dim, self.noise_correlation)
         return lambda actor, obs, step: perturb(actor(obs, np), self.noise(step, np) * next(noise), np)
-

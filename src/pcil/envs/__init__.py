@@ -13,7 +13,7 @@ from gymnasium import spaces, wrappers
 from pcil.errors import InputError
 from pcil.types import Spec
 
-__all__ = ["TASKS", "make", "register", "spec", "task_name"]
+__all__ = ["TASKS", "ends_early", "make", "register", "spec", "task_name"]
 
 TASKS = (
     "finger_spin",
@@ -34,6 +34,7 @@ LONGEST_EPISODE = 100_000
 
 _TOYS = {
     "toy/point_mass-v0": "PointMass",
+    "toy/reach-v0": "Reach",
     "toy/probe_1-v0": "ConstantReward",
     "toy/probe_2-v0": "ObservedReward",
     "toy/probe_3-v0": "DelayedReward",
@@ -123,6 +124,11 @@ def spec(env: gymnasium.Env) -> Spec:
     inner = env.unwrapped
     action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
     return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
+
+
+def ends_early(env: gymnasium.Env) -> bool:
+    """Whether an episode may terminate: it is taken to, unless the environment has an attribute `ends_early` that is False."""
+    return bool(getattr(env.unwrapped, "ends_early", True))
 
 
 def _gymnasium_id(task: str) -> str:

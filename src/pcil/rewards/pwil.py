@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.networks import Scaler
+from pcil.networks import Normalizer, Scaler
 from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
 from pcil.types import Batch, Window
 
@@ -29,7 +29,6 @@ class PWILState(eqx.Module):
     """Expert steps, as `seen` gives them, before they are standardised or embedded."""
     mean: Float[Array, "1 inputs"]
     deviation: Float[Array, "1 inputs"]
-    """Of the atoms; 0 for an entry that is the same in all of them."""
     horizon: Int[Array, ""]
     """Steps among which an episode's mass is divided: those of the longest demonstration."""
     slow: SlowFeatures | None
@@ -69,17 +68,6 @@ def greedy_distances(
 
     full = jnp.zeros(atoms.shape[0], jnp.int32)
     return jax.lax.scan(step, full, (jnp.arange(points.shape[0]), points))[1]
-
-
-def standardised(
-    x: Float[Array, "rows inputs"], mean: Float[Array, "1 inputs"], deviation: Float[Array, "1 inputs"]
-) -> Float[Array, "rows inputs"]:
-    """Inputs in standard deviations from the mean, whatever their units.
-
-    An entry that never varies in the demonstrations has no scale: one deviation away is what differs from it at all.
-    """
-    distance = x - mean
-    return jnp.where(deviation > 0, distance / jnp.where(deviation > 0, deviation, 1.0), jnp.sign(distance))
 
 
 @dataclass(frozen=True)
@@ -133,11 +121,10 @@ class PWIL(Reward):
             seen = self.seen(jnp.asarray(demo.obs), jnp.asarray(demo.action))
             chosen.append(seen[jnp.minimum(rows, steps - 1)])
         atoms = jnp.concatenate(chosen)
-        scaler = Scaler.init(atoms.shape[1]).update(atoms)
-        deviation = jnp.where(scaler.variance > 0, scaler.normalizer.deviation, 0.0)
+        scale = Scaler.init(atoms.shape[1]).update(atoms).normalizer
         slow = SlowFeatures.init(embed) if self.inputs == "trunk" else None
         horizon = jnp.int32(max(len(demo.obs) for demo in demos))
-        return PWILState(atoms, scaler.mean[None], deviation[None], horizon, slow)
+        return PWILState(atoms, scale.mean[None], scale.deviation[None], horizon, slow)
 
     def update(
         self, state: PWILState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
@@ -159,7 +146,7 @@ class PWIL(Reward):
         del embed, key
         both = state.atoms, self.seen(obs, action)
         if state.slow is None:
-            atoms, points = (standardised(x, state.mean, state.deviation) for x in both)
+            atoms, points = map(Normalizer(state.mean[0], state.deviation[0]), both)
             dimensions = obs.shape[-1] + action.shape[-1]
         else:
             atoms, points = (state.slow.embed(x) for x in both)

@@ -7,6 +7,7 @@ flees it, if the pay is negative), whatever the demonstrations show.
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,14 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import envs, loop, runs
+from pcil import envs, loop, presets, runs
 from pcil.agents import BC, DrQV2
+from pcil.config import changed
+from pcil.demos import Demonstrations
 from pcil.errors import InputError
 from pcil.policy import Policy
 from pcil.replay import Replay
 from pcil.rewards import Reward
 from pcil.types import Episode
-from small import narrow, small_run
+from small import POINT_MASS, narrow, save_point_mass_demos, small_run
 
 GAMMA = 0.9
 EXIT = "pcil_test/exit-v0"
@@ -118,3 +121,61 @@ def test_the_absorbing_state_is_the_first_of_one_window_as_every_other_state(n: 
 def test_cloning_has_no_absorbing_states() -> None:
     with pytest.raises(InputError, match="no absorbing states"):
         BC(absorbing=True)
+
+
+# --- What a run decides by itself ---
+
+
+def demos_of(task: str, folder: Path, ends: int = 0) -> str:
+    """Four demonstrations, of which so many are said to have ended early."""
+    source = Demonstrations.load(save_point_mass_demos(folder))
+    episodes = [dataclasses.replace(e, terminated=i < ends) for i, e in enumerate(source.episodes)]
+    return str(dataclasses.replace(source, task=task, episodes=tuple(episodes)).save(folder / f"ends-{ends}-v0"))
+
+
+class Told(runs.Silent):
+    """Keeps what is said, and stops after the first episode."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def stop(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("method", "changes", "ends", "absorbing", "why"),
+    [
+        ("pcil", {}, 0, False, "no episode of toy/point_mass-v0 ends early"),
+        ("dac", {}, 3, True, "3 of 4 demonstrations end early"),
+        ("pcil", {"agent.absorbing": False}, 3, False, "as agent.absorbing says"),
+        ("expert", {}, 0, False, "no reward is learned"),
+        ("bc", {}, 4, False, "no reward is learned"),
+    ],
+)
+def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_end_early(
+    method: str, changes: dict[str, Any], ends: int, absorbing: bool, why: str, tmp_path: Path
+) -> None:
+    demos = demos_of(POINT_MASS, tmp_path, ends) if method != "expert" else None
+    run = changed(small_run(method, demos=demos), changes)
+    if method == "bc":
+        run = dataclasses.replace(run, agent=narrow(BC()), frames=1200)
+    told = Told()
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", told)
+    assert told.said[0] == f"Absorbing state: {'on' if absorbing else 'off'}; {why}."
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["agent"]["absorbing"] is absorbing
+    with pytest.raises(loop.Stopped):  # the same command goes on
+        runs.execute(run, tmp_path / "run", told)
+    assert any("Resuming" in text for text in told.said)
+
+
+def test_an_environment_that_does_not_say_so_is_taken_to_end_early_and_the_ten_tasks_do_not() -> None:
+    assert envs.ends_early(envs.make(EXIT)) and envs.ends_early(envs.make("toy/reach-v0"))
+    assert not envs.ends_early(envs.make("pendulum_swingup"))
+    demos = Demonstrations(EXIT, (), {})
+    run, why = runs.with_absorbing_decided(presets.make(EXIT), demos)
+    assert run.agent.absorbing and why == f"an episode of {EXIT} may end early"

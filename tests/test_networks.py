@@ -15,7 +15,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcil.networks import LAYER_NORM_EPSILON, MLP, SCALER_FLOOR, SCALER_RATE, Actor, Critic, Scaler, Trunk, unit_sphere
+from pcil.networks import (
+    LAYER_NORM_EPSILON,
+    MLP,
+    SCALED_BOUND,
+    SCALER_RATE,
+    Actor,
+    Critic,
+    Scaler,
+    Trunk,
+    scaled,
+    unit_sphere,
+    unscaled,
+)
 from pcil.noise import ACTION_MARGIN, LinearSchedule, normal_steps, perturb
 from pcil.optimiser import adam_init, adam_step
 
@@ -296,12 +308,44 @@ def test_the_scaler_forgets_what_is_long_past() -> None:
 
 @law
 @given(st.integers(0, 2**32))
-def test_a_folded_trunk_gives_for_plain_observations_what_the_trunk_gives_for_scaled_ones(seed: int) -> None:
+def test_an_unscaled_trunk_gives_for_plain_observations_what_the_trunk_gives_for_scaled_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     trunk = randomised(Trunk.init(4, FEATURES, key=jax.random.key(0)), seed)
-    mean, variance = rng.normal(size=4) * 10, rng.uniform(0, 9, size=4)
+    mean, variance = rng.normal(size=4) * 10, rng.uniform(0.1, 9, size=4)
     scaler = Scaler(*(jnp.asarray(x, jnp.float32) for x in (mean, variance, 5.0)))
-    obs = (rng.normal(size=(6, 4)) * 3 + mean).astype(np.float32)
-    naive = (obs - mean) / np.sqrt(variance + SCALER_FLOOR**2)
-    assert np.allclose(scaler.fold(trunk)(jnp.asarray(obs)), trunk(jnp.asarray(naive, jnp.float32)), atol=2e-3)
-    assert np.allclose(scaler(jnp.asarray(obs)), naive, rtol=1e-3, atol=1e-3)
+    obs = (rng.normal(size=(6, 4)) * 5 * np.sqrt(variance) + mean).astype(np.float32)
+    naive = np.clip((obs - mean) / np.sqrt(variance), -SCALED_BOUND, SCALED_BOUND)
+    assert np.allclose(scaled(scaler, jnp.asarray(obs)), naive, rtol=1e-3, atol=1e-3)
+    plain = unscaled(trunk, scaler)
+    assert np.allclose(plain(jnp.asarray(obs)), trunk(jnp.asarray(naive, jnp.float32)), atol=2e-3)
+    assert np.allclose(jax.tree.map(np.asarray, plain)(obs, np), plain(jnp.asarray(obs)), atol=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e6, -3e-5])
+def test_an_entry_that_never_varies_is_scaled_to_zero_and_one_that_leaves_it_is_bounded(value: float) -> None:
+    scaler = Scaler.init(1)
+    for _ in range(10):
+        scaler = scaler_update(scaler, np.full((8, 1), value, np.float32))
+    assert scaler.mean[0] == np.float32(value) and scaler.variance[0] == 0
+    assert scaled(scaler, jnp.full((2, 1), value))[0, 0] == 0
+    assert abs(scaled(scaler, jnp.full((2, 1), value + 1e7))[0, 0]) <= SCALED_BOUND
+
+
+def test_an_entry_that_stays_where_it_is_for_long_is_not_blown_up() -> None:
+    """Rounding stops its mean short of it, and the variance at what is missing."""
+    scaler = Scaler(jnp.array([0.3]), jnp.array([1.0]), jnp.float32(1e6))
+    rows = np.full((8, 1), 0.7, np.float32)
+    scaler = jax.lax.fori_loop(0, 100_000, lambda _, s: s.update(jnp.asarray(rows)), scaler)
+    assert scaler.variance[0] < 1e-8
+    assert abs(scaled(scaler, jnp.asarray(rows))[0, 0]) < 1.01
+
+
+def test_far_from_zero_the_scaler_keeps_what_float32_has_left() -> None:
+    rng = np.random.default_rng(0)
+    rows = (1e6 + rng.normal(size=(20, 64, 1))).astype(np.float32)
+    scaler = Scaler.init(1)
+    for batch in rows:
+        scaler = scaler_update(scaler, batch)
+    exact = rows.astype(np.float64)
+    assert float(scaler.mean[0]) == pytest.approx(exact.mean(), abs=0.1)
+    assert float(scaler.variance[0]) == pytest.approx(exact.var(), rel=0.05)

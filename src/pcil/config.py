@@ -127,7 +127,8 @@ class Run:
         kept = {
             name: getattr(self, name) for name in ("task", "label")
         }  # older than every run; not each reward takes each label
-        return _plain(self, **kept, agent=_plain(self.agent), reward=_plain(self.reward))
+        agent = dataclasses.replace(_plain(self.agent), absorbing=False)  # None is decided before `run.json` is written
+        return _plain(self, **kept, agent=agent, reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:
         """Every setting, nested, as JSON gives it back; agent and reward say their class."""

@@ -40,6 +40,8 @@ def init(method: Method, spec: Spec, demos: Sequence[Batch], seed: int | Array) 
     root = jax.random.key_data(jax.random.key(seed))
     key = jax.random.wrap_key_data(root)
     agent = method.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
+    if demos:
+        agent = method.agent.observe(agent, jnp.concatenate([demo.obs for demo in demos]))
     reward = method.reward.init(demos, frozen_embed(method, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
     window = _zeros(spec, method.agent.batch_size, max(method.agent.n_step, method.reward.span))
@@ -87,14 +89,15 @@ def _step(
 ) -> tuple[Learner, dict[str, Array]]:
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
-    embed = frozen_embed(method, learner.agent)
+    agent = method.agent.observe(learner.agent, window.obs[:, 0])
+    embed = frozen_embed(method, agent)
     seen = seen or Window(*(array[: method.reward.batch_size] for array in window))
     expert = expert or Window(*(array[:0] for array in window))
     reward_state, reward_metrics = method.reward.update(learner.reward, expert, seen, embed, key=reward_key)
     if method.label == "sampled":
         fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
-    agent_state, agent_metrics = method.agent.update(learner.agent, window, step=step, key=agent_key)
+    agent_state, agent_metrics = method.agent.update(agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
     return Learner(agent_state, reward_state, learner.root, learner.totals), metrics

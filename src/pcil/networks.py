@@ -5,6 +5,7 @@ Weights are `[in, out]`. Every linear layer starts orthogonal with gain 1 and bi
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from types import ModuleType
 from typing import Any
@@ -17,8 +18,12 @@ from jaxtyping import Array, Float, PRNGKeyArray
 LAYER_NORM_EPSILON = 1e-5
 SCALER_RATE = 1e-3
 """Least share of a new batch in the running statistics of observations."""
-SCALER_FLOOR = 1e-2
-"""Least standard deviation that observations are divided by, in their own units."""
+SCALER_FLOOR = 1e-6
+"""Least standard deviation that an entry is divided by, as a share of its mean: the mean itself has no more digits."""
+LEAST_DEVIATION = 1e-20
+"""Of an entry that is always 0: small beside any unit, and no division by it overflows."""
+SCALED_BOUND = 10.0
+"""Scaled observations are clipped to this many standard deviations."""
 
 
 def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Any, "in out"]:
@@ -55,6 +60,17 @@ class MLP(eqx.Module):
         return _add(x @ self.weights[-1], self.biases[-1])
 
 
+class Normalizer(eqx.Module):
+    """Observations in standard deviations from their mean, clipped to `SCALED_BOUND` of them."""
+
+    mean: Float[Any, " obs"]
+    deviation: Float[Any, " obs"]
+
+    def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch obs"]:
+        scaled = (obs - _rows(self.mean, obs)) / _rows(self.deviation, obs)
+        return xp.minimum(xp.maximum(scaled, -SCALED_BOUND), SCALED_BOUND)
+
+
 class Trunk(eqx.Module):
     """Linear, layer normalisation, tanh: observations to features in (-1, 1) (authors' code: agent/drqv2.py)."""
 
@@ -62,6 +78,8 @@ class Trunk(eqx.Module):
     bias: Float[Any, " features"]
     scale: Float[Any, " features"]
     offset: Float[Any, " features"]
+    normalizer: Normalizer | None = None
+    """What observations go through first, where the trunk takes them in the environment's units."""
 
     @classmethod
     def init(cls, obs_dim: int, feature_dim: int, *, key: PRNGKeyArray) -> Trunk:
@@ -73,6 +91,7 @@ class Trunk(eqx.Module):
         )
 
     def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch features"]:
+        obs = obs if self.normalizer is None else self.normalizer(obs, xp)
         x = _add(obs @ self.weight, self.bias)
         share = 1 / x.shape[-1]  # NumPy's own mean takes longer than the whole layer
         centred = x - x.sum(axis=-1, keepdims=True) * share
@@ -80,9 +99,20 @@ class Trunk(eqx.Module):
         normal = centred / xp.sqrt(variance + LAYER_NORM_EPSILON)
         return xp.tanh(_add(normal * _rows(self.scale, normal), self.offset))
 
+    def without_last(self) -> Trunk:
+        """The trunk of observations that lack the last entry, which is 0 in all of them."""
+        if self.normalizer is None:
+            return dataclasses.replace(self, weight=self.weight[:-1])
+        last = self.normalizer(jnp.zeros_like(self.normalizer.mean))[-1]
+        shorter = Normalizer(self.normalizer.mean[:-1], self.normalizer.deviation[:-1])
+        return dataclasses.replace(self, weight=self.weight[:-1], bias=self.bias + last * self.weight[-1], normalizer=shorter)
+
 
 class Scaler(eqx.Module):
-    """Running mean and variance of observations, and observations scaled by them."""
+    """Running mean and variance of observations.
+
+    Scaled observations are the same whatever units an entry `x` comes in: as `a x + b`, and its mean and deviation with it.
+    """
 
     mean: Float[Any, " obs"]
     variance: Float[Any, " obs"]
@@ -97,23 +127,32 @@ class Scaler(eqx.Module):
         """The plain average over the first batches, then over about the last `1 / SCALER_RATE`.
 
         Mixing a batch of mean `m` and variance `v` at rate `r` into `mean` and `variance` gives the mixture's variance,
-        `(1 - r) variance + r v + r (1 - r) (m - mean)^2`.
+        `(1 - r) variance + r v + r (1 - r) (m - mean)^2`. Sums are taken of distances from the batch's first row: far from
+        zero they keep their digits, and an entry that never varies has its mean exactly.
         """
         rate = jnp.maximum(1 / (self.count + 1), SCALER_RATE)
-        shift = jnp.mean(obs, axis=0) - self.mean
-        variance = (1 - rate) * (self.variance + rate * shift**2) + rate * jnp.var(obs, axis=0)
+        distance = obs - obs[:1]
+        centre = jnp.mean(distance, axis=0)
+        shift = (obs[0] - self.mean) + centre
+        spread = jnp.mean((distance - centre[None]) ** 2, axis=0)
+        variance = (1 - rate) * self.variance + rate * spread + ((1 - rate) * rate * shift) * shift
         return Scaler(self.mean + rate * shift, variance, self.count + 1)
 
-    def _deviation(self) -> Float[Array, " obs"]:
-        return jnp.sqrt(self.variance + SCALER_FLOOR**2)
+    @property
+    def normalizer(self) -> Normalizer:
+        """What observations are scaled by now; an entry that has never varied is 0 there and at the bound elsewhere."""
+        deviation = jnp.sqrt(self.variance + (SCALER_FLOOR * self.mean) ** 2)
+        return Normalizer(self.mean, jnp.maximum(deviation, LEAST_DEVIATION))
 
-    def __call__(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
-        return (obs - _rows(self.mean, obs)) / _rows(self._deviation(), obs)
 
-    def fold(self, trunk: Trunk) -> Trunk:
-        """The trunk that gives for plain observations what `trunk` gives for scaled ones: its first layer is linear."""
-        weight = trunk.weight / self._deviation()[:, None]
-        return Trunk(weight, trunk.bias - self.mean @ weight, trunk.scale, trunk.offset)
+def scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
+    """Observations as networks are given them in an update."""
+    return obs if scaler is None else scaler.normalizer(obs)
+
+
+def unscaled(trunk: Trunk, scaler: Scaler | None) -> Trunk:
+    """The trunk of observations in the environment's units, from one of scaled observations."""
+    return dataclasses.replace(trunk, normalizer=scaler and scaler.normalizer)
 
 
 class Actor(eqx.Module):

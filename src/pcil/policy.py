@@ -14,7 +14,7 @@ import numpy as np
 
 from pcil import files
 from pcil.errors import InputError
-from pcil.networks import MLP, Actor, Trunk
+from pcil.networks import MLP, Actor, Normalizer, Trunk
 from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"
@@ -118,10 +118,13 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     if header["format"] != FORMAT:
         raise ValueError(f"format {header['format']!r} is not {FORMAT!r}")
     layers = range(int(header["layers"]))
-    trunk = Trunk(*(arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset")))
+    scaling = [arrays[name] for name in ("trunk.normalizer.mean", "trunk.normalizer.deviation") if name in arrays]
+    normalizer = Normalizer(*scaling) if scaling else None  # older policies have the scale in their first layer
+    weight, bias, scale, offset = (arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset"))
+    trunk = Trunk(weight, bias, scale, offset, normalizer)
     weights = tuple(arrays[f"head.weights.{i}"] for i in layers)
     biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
-    if not layers or len(arrays) != 4 + 2 * len(layers):
+    if not layers or len(arrays) != 4 + len(scaling) + 2 * len(layers):
         raise ValueError("names and arrays do not fit")
     if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
         raise ValueError("its task is no name or its info no table")
@@ -130,6 +133,8 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     width = trunk.weight.shape[1]
     if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
         raise ValueError("the trunk's shapes do not fit")
+    if any(array.shape != trunk.weight.shape[:1] for array in scaling):
+        raise ValueError("the shapes of its scaling do not fit")
     for weight, bias in zip(weights, biases, strict=True):
         if weight.shape != (width, *bias.shape):
             raise ValueError(f"a layer of shape {weight.shape} follows one of width {width}")

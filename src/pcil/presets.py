@@ -161,7 +161,7 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str
     ("tcn-gail", "default"): {"reward": TCN(temperature=0.07, learning_rate=5e-4, head="gail")},  # as tcn
     ("bc", "paper"): {**BC_SETTINGS, "agent": BC()},  # authors' agent/bc.py; width of the paper's Table
     ("bc", "released"): bc_as_released,
-    ("bc", "default"): {**BC_SETTINGS, "agent": BC()},  # as paper
+    ("bc", "default"): {**BC_SETTINGS, "agent": BC(standardise=True)},  # as paper; scaled observations: ours
     ("expert", "paper"): {"reward": TaskReward()},
     ("expert", "released"): expert_as_released,
     ("expert", "default"): {"reward": TaskReward()},

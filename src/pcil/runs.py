@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pcil import compilation, envs, files, fit, loop, presets
-from pcil.config import Run, completed, differences
+from pcil.config import Run, changed, completed, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
 from pcil.evaluate import Evaluation
@@ -78,9 +78,11 @@ def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
     compilation.use_cache()
     folder, demos = files.expanded(folder), demonstrations(run, reporter.say)
+    run, why = with_absorbing_decided(run, demos)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
+            reporter.say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
             final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter).counters.final_return
             _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
@@ -117,6 +119,26 @@ def demonstrations(run: Run, say: Callable[[str], None] = lambda text: None) -> 
     return demos
 
 
+def with_absorbing_decided(run: Run, demos: Demonstrations | None) -> tuple[Run, str]:
+    """The run with `agent.absorbing` decided, and the reason in words.
+
+    Without the absorbing state an early end is worth 0 to the agent: where learned rewards are positive it avoids a goal that
+    ends the episode, and where they are negative it gives up early (Kostrikov et al. 2019, section 4.2).
+    """
+    if run.agent.absorbing is not None:
+        return run, "as agent.absorbing says"
+    ended = sum(episode.terminated for episode in demos.episodes) if demos else 0
+    if run.agent.offline or not run.reward.needs_demos:
+        absorbing, why = False, "no reward is learned"
+    elif demos and ended:
+        absorbing, why = True, f"{ended} of {len(demos.episodes)} demonstrations end early"
+    elif envs.ends_early(envs.make(run.task, env_kwargs=run.env_kwargs)):
+        absorbing, why = True, f"an episode of {run.task} may end early"
+    else:
+        absorbing, why = False, f"no episode of {run.task} ends early"
+    return changed(run, {"agent.absorbing": absorbing}), why
+
+
 @contextlib.contextmanager
 def _claimed(folder: Path) -> Iterator[None]:
     """The folder, made if need be, for this process alone."""
@@ -135,7 +157,9 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 def check(run: Run, folder: Path) -> None:
     """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
-    identity = _identity(run, demonstrations(run))
+    demos = demonstrations(run)
+    run, _ = with_absorbing_decided(run, demos)
+    identity = _identity(run, demos)
     if (folder / "run.json").exists():
         _refuse_another(run, folder, identity)
 
@@ -167,14 +191,14 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
         before = files.read_json(folder / "run.json")
-        changed = differences(completed(before["run"], run.plain.to_json()), identity["run"])
-        changed += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
+        found = differences(completed(before["run"], run.plain.to_json()), identity["run"])
+        found += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder."
         ) from error
-    if changed:
-        raise InputError(f"The folder {folder} holds another run: {'; '.join(changed)}; use its settings or another --out.")
+    if found:
+        raise InputError(f"The folder {folder} holds another run: {'; '.join(found)}; use its settings or another --out.")
     return before
 
 

@@ -141,16 +141,17 @@ def optimal_return(env: gymnasium.Env, seed: int) -> float:
 
 
 def test_the_actor_that_leaves_acts_on_plain_observations() -> None:
-    """Large units, far from zero: what acts is the network on standardised observations, its scale folded in."""
+    """Large units, far from zero: what acts is the network on standardised observations."""
     agent = dataclasses.replace(AGENT, standardise=True)
     state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
     window = window._replace(obs=window.obs * jnp.array([[[1.0, 30.0, 0.01]]]) + jnp.array([[[0.0, -50.0, 2.0]]]))
-    update = jax.jit(lambda s, k: agent.update(s, window, step=jnp.int32(0), key=k)[0])
+    seen = window.obs.reshape(-1, SPEC.obs_dim)
+    update = jax.jit(lambda s, k: agent.update(agent.observe(s, seen), window, step=jnp.int32(0), key=k)[0])
     for i in range(5):
         state = update(state, jax.random.key(i))
     assert state.scaler is not None
-    flat = np.asarray(window.obs[:, 0], np.float64)
-    scaled = ((flat - flat.mean(axis=0)) / np.sqrt(flat.var(axis=0) + 1e-4)).astype(np.float32)
+    flat = np.asarray(seen, np.float64)
+    scaled = ((np.asarray(window.obs[:, 0]) - flat.mean(axis=0)) / flat.std(axis=0)).astype(np.float32)
     assert np.allclose(agent.actor(state)(window.obs[:, 0]), state.actor(jnp.asarray(scaled)), atol=1e-3)
     assert np.allclose(agent.trunk(state, "critic")(window.obs[:, 0]), state.critic.trunk(jnp.asarray(scaled)), atol=1e-3)
 

@@ -33,8 +33,9 @@ class Agent(abc.ABC):
     """Windows in one update."""
     n_step: int = 3
     """Steps of reward before the target bootstraps: the length of a window."""
-    absorbing: bool = False
-    """Let a termination lead into an absorbing state, which observations mark by a further entry; no end is free then."""
+    absorbing: bool | None = None
+    """Whether a termination leads to an absorbing state, marked by a further entry in observations, so that an early end is
+    worth what the reward says of it; None: where the reward is learned and an episode may end early."""
 
     def __post_init__(self) -> None:
         check_kinds(self)
@@ -43,6 +44,11 @@ class Agent(abc.ABC):
     @abc.abstractmethod
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> Any:
         """The state before the first update."""
+
+    def observe(self, state: Any, obs: Float[Array, "rows obs"]) -> Any:
+        """The state after its statistics of observations have taken in these rows, before anything is computed from them."""
+        del obs
+        return state
 
     @abc.abstractmethod
     def update(self, state: Any, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[Any, Metrics]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from math import inf, log, pi
 from typing import ClassVar, Literal
@@ -14,16 +15,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import InputError, check_ranges
-from pcil.networks import Actor, Trunk
+from pcil.networks import Actor, Scaler, Trunk, scaled, unscaled
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
 
 class BCState(eqx.Module):
-    """The actor and its optimiser's moments."""
+    """The actor, its optimiser's moments, and the scale of observations."""
 
     actor: Actor
     moments: Moments
+    scaler: Scaler | None
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class BC(Agent):
     """Width of the trunk."""
     hidden: int = 256
     """Width of the two hidden layers."""
+    standardise: bool = False
+    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunk: units make no difference then."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,7 +55,7 @@ class BC(Agent):
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> BCState:
         actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=key)
-        return BCState(actor, adam_init(actor))
+        return BCState(actor, adam_init(actor), Scaler.init(spec.obs_dim) if self.standardise else None)
 
     def loss(
         self, actor: Actor, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"]
@@ -62,18 +66,23 @@ class BC(Agent):
         constant = action.shape[-1] * (log(self.deviation) + log(2 * pi) / 2)
         return error / (2 * self.deviation**2) + constant, {"squared_error": error}
 
+    def observe(self, state: BCState, obs: Float[Array, "rows obs"]) -> BCState:
+        return dataclasses.replace(state, scaler=state.scaler and state.scaler.update(obs))
+
     def update(self, state: BCState, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[BCState, Metrics]:
         del step, key
         gradient_of = jax.value_and_grad(self.loss, has_aux=True)
-        (loss, metrics), gradient = gradient_of(state.actor, window.obs[:, 0], window.action[:, 0])
-        return BCState(*adam_step(state.actor, gradient, state.moments, self.learning_rate)), {"loss": loss, **metrics}
+        obs = scaled(state.scaler, window.obs[:, 0])
+        (loss, metrics), gradient = gradient_of(state.actor, obs, window.action[:, 0])
+        actor, moments = adam_step(state.actor, gradient, state.moments, self.learning_rate)
+        return BCState(actor, moments, state.scaler), {"loss": loss, **metrics}
 
     def actor(self, state: BCState) -> Actor:
-        return state.actor
+        return Actor(self.trunk(state, "actor"), state.actor.head)
 
     def trunk(self, state: BCState, whose: Literal["critic", "actor"]) -> Trunk:
         del whose
-        return state.actor.trunk
+        return unscaled(state.actor.trunk, state.scaler)
 
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
         del action_dim, rng

@@ -5,6 +5,7 @@ Facts and sources: the authors' drqv2.py; `docs/methods/drqv2.md` lists where we
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from math import inf
 from typing import Literal
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
 from pcil.losses import n_step_target
-from pcil.networks import Actor, Critic, Scaler, Trunk
+from pcil.networks import Actor, Critic, Scaler, Trunk, scaled, unscaled
 from pcil.noise import LinearSchedule, normal_steps, perturb
 from pcil.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
@@ -58,8 +59,7 @@ class DrQV2(Agent):
     """Correlation of the acting noise of a step with that of the step before; 0 is white noise, as DrQ-v2's. Correlated
     noise moves a joint for several steps in one direction."""
     standardise: bool = False
-    """Give the trunks observations of running mean 0 and standard deviation 1: layer normalisation forgets an observation's
-    length, and entries in large units drown the others."""
+    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunks: units make no difference then."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,13 +101,16 @@ class DrQV2(Agent):
     def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
         """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`; `a' = 0` in the absorbing one."""
         obs_n = window.obs[:, -1]
-        action = perturb(state.actor(_scaled(state.scaler, obs_n)), noise) * self._alive(obs_n)[:, None]
-        first, second = state.critic_target(_scaled(state.scaler, obs_n), action)
+        action = perturb(state.actor(scaled(state.scaler, obs_n)), noise) * self._alive(obs_n)[:, None]
+        first, second = state.critic_target(scaled(state.scaler, obs_n), action)
         return n_step_target(window.reward, window.discount, jnp.minimum(first, second), self.gamma)
 
     def _alive(self, obs: Float[Array, "batch obs"]) -> Float[Array, " batch"]:
         """0 in the absorbing state, 1 elsewhere."""
         return 1 - obs[:, -1] if self.absorbing else jnp.ones(obs.shape[0])
+
+    def observe(self, state: DrQV2State, obs: Float[Array, "rows obs"]) -> DrQV2State:
+        return dataclasses.replace(state, scaler=state.scaler and state.scaler.update(obs))
 
     def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
         alive = self._alive(window.obs[:, 0])
@@ -115,8 +118,7 @@ class DrQV2(Agent):
         noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
         target = jax.lax.stop_gradient(self.target(state, window, noise[0]))
 
-        scaler = state.scaler and state.scaler.update(window.obs[:, 0])
-        obs, action = _scaled(scaler, window.obs[:, 0]), window.action[:, 0]
+        obs, action = scaled(state.scaler, window.obs[:, 0]), window.action[:, 0]
         gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
         critic, critic_moments = adam_step(state.critic, gradient, state.critic_moments, self.learning_rate)
 
@@ -125,24 +127,15 @@ class DrQV2(Agent):
 
         critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
         metrics |= {"actor_loss": loss}
-        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments, scaler), metrics
+        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments, state.scaler), metrics
 
     def actor(self, state: DrQV2State) -> Actor:
-        return eqx.tree_at(lambda actor: actor.trunk, state.actor, self._plain(state.actor.trunk, state.scaler, self.absorbing))
+        trunk = self.trunk(state, "actor")
+        return Actor(trunk.without_last() if self.absorbing else trunk, state.actor.head)
 
     def trunk(self, state: DrQV2State, whose: Literal["critic", "actor"]) -> Trunk:
-        return self._plain(state.critic.trunk if whose == "critic" else state.actor.trunk, state.scaler, False)
-
-    @staticmethod
-    def _plain(trunk: Trunk, scaler: Scaler | None, drop_last: bool) -> Trunk:
-        """The trunk for plain observations; without the absorbing state's entry, which is 0 wherever a policy acts."""
-        trunk = trunk if scaler is None else scaler.fold(trunk)
-        return eqx.tree_at(lambda t: t.weight, trunk, trunk.weight[:-1]) if drop_last else trunk
+        return unscaled(state.critic.trunk if whose == "critic" else state.actor.trunk, state.scaler)
 
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
         noise = normal_steps(rng, action_dim, self.noise_correlation)
         return lambda actor, obs, step: perturb(actor(obs, np), self.noise(step, np) * next(noise), np)
-
-
-def _scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
-    return obs if scaler is None else scaler(obs)

@@ -15,7 +15,7 @@ from gymnasium import spaces, wrappers
 from pcil.errors import InputError, json_object
 from pcil.types import Origin, Spec
 
-__all__ = ["TASKS", "make", "register", "spec", "task_name"]
+__all__ = ["TASKS", "ends_early", "make", "register", "spec", "task_name"]
 
 TASKS = (
     "finger_spin",
@@ -36,6 +36,7 @@ LONGEST_EPISODE = 100_000
 
 _TOYS = {
     "toy/point_mass-v0": "PointMass",
+    "toy/reach-v0": "Reach",
     "toy/probe_1-v0": "ConstantReward",
     "toy/probe_2-v0": "ObservedReward",
     "toy/probe_3-v0": "DelayedReward",
@@ -132,6 +133,11 @@ def spec(env: gymnasium.Env) -> Spec:
     inner = env.unwrapped
     action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
     return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
+
+
+def ends_early(env: gymnasium.Env) -> bool:
+    """Whether an episode may terminate: it is taken to, unless the environment has an attribute `ends_early` that is False."""
+    return bool(getattr(env.unwrapped, "ends_early", True))
 
 
 def origin(env: gymnasium.Env) -> Origin:

@@ -141,6 +141,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._fill_observation, self._reward = (views_for(self.name) or generic_views)(env)
         inherited = type(env.task).get_termination is control.Task.get_termination  # which is: never
         self._termination = None if inherited else env.task.get_termination
+        self.ends_early = not inherited
 
     def _define_spaces(self) -> None:
         self._obs_dim = sum(int(np.prod(entry.shape)) for entry in self._env.observation_spec().values())

@@ -24,6 +24,7 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
 
     SPEED = 0.1
     NUM_STEPS = 50
+    ends_early = False
 
     def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -47,6 +48,41 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
     def optimal_action(cls, obs: np.ndarray) -> np.ndarray:
         """Straight home along each axis: the axes do not interact, so every step is the closest that can be reached."""
         return np.clip(-np.asarray(obs) / cls.SPEED, -1.0, 1.0)
+
+
+class Reach(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A point on the line [-2, 2] that moves by `SPEED` times the action; an episode ends where the goal is reached.
+
+    The observation is `[position, goal]`, the reward minus the distance. An episode is truncated after `NUM_STEPS` steps.
+    """
+
+    SPEED = 0.1
+    NUM_STEPS = 40
+    REACHED = 0.08
+
+    def __init__(self) -> None:
+        self.observation_space = gymnasium.spaces.Box(-2.0, 2.0, (2,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self._state, self._steps = np.zeros(2), 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Puts point and goal anywhere in [-1, 1]."""
+        super().reset(seed=seed)
+        self._state, self._steps = self.np_random.uniform(-1.0, 1.0, 2), 0
+        return self._state.astype(np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Moves the point; it terminates within `REACHED` of the goal."""
+        self._state[0] = np.clip(self._state[0] + self.SPEED * checked_action(action, (1,))[0], -2.0, 2.0)
+        self._steps += 1
+        distance = float(abs(self._state[0] - self._state[1]))
+        reached = distance < self.REACHED
+        return self._state.astype(np.float32), -distance, reached, not reached and self._steps >= self.NUM_STEPS, {}
+
+    @classmethod
+    def optimal_action(cls, obs: np.ndarray) -> np.ndarray:
+        """Straight to the goal."""
+        return np.clip((obs[..., 1:] - obs[..., :1]) / cls.SPEED, -1.0, 1.0)
 
 
 class Probe(gymnasium.Env[np.ndarray, np.ndarray], abc.ABC):

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
+from pcil.networks import Normalizer, Scaler
 from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
 from pcil.types import Batch, Window
 
@@ -120,11 +121,10 @@ class PWIL(Reward):
             seen = self.seen(jnp.asarray(demo.obs), jnp.asarray(demo.action))
             chosen.append(seen[jnp.minimum(rows, steps - 1)])
         atoms = jnp.concatenate(chosen)
-        mean, deviation = atoms.mean(axis=0, keepdims=True), atoms.std(axis=0, keepdims=True)
-        constant = deviation <= 1e-6 * jnp.abs(atoms).max(axis=0, keepdims=True)
+        scale = Scaler.init(atoms.shape[1]).update(atoms).normalizer
         slow = SlowFeatures.init(embed) if self.inputs == "trunk" else None
         horizon = jnp.int32(max(len(demo.obs) for demo in demos))
-        return PWILState(atoms, mean, jnp.where(constant, 1.0, deviation), horizon, slow)
+        return PWILState(atoms, scale.mean[None], scale.deviation[None], horizon, slow)
 
     def update(
         self, state: PWILState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
@@ -146,7 +146,7 @@ class PWIL(Reward):
         del embed, key
         both = state.atoms, self.seen(obs, action)
         if state.slow is None:
-            atoms, points = ((x - state.mean) / state.deviation for x in both)
+            atoms, points = map(Normalizer(state.mean[0], state.deviation[0]), both)
             dimensions = obs.shape[-1] + action.shape[-1]
         else:
             atoms, points = (state.slow.embed(x) for x in both)

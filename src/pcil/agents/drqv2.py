@@ -59,7 +59,7 @@ class DrQV2(Agent):
     """Correlation of the acting noise of a step with that of the step before; 0 is white noise, as DrQ-v2's. Correlated
     noise moves a joint for several steps in one direction."""
     standardise: bool = False
-    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunks: units make no difference then."""
+    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunks: units make no difference."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

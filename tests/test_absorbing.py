@@ -6,6 +6,7 @@ flees it, if the pay is negative), whatever the demonstrations show.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 from dataclasses import dataclass
@@ -17,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import envs, loop, presets, runs
+from pcil import demos, envs, loop, presets, runs
 from pcil.agents import BC, DrQV2
 from pcil.config import changed
 from pcil.demos import Demonstrations
+from pcil.envs.toy import Reach
 from pcil.errors import InputError
 from pcil.policy import Policy
 from pcil.replay import Replay
@@ -159,8 +161,8 @@ class Told(runs.Silent):
 def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_end_early(
     method: str, changes: dict[str, Any], ends: int, absorbing: bool, why: str, tmp_path: Path
 ) -> None:
-    demos = demos_of(POINT_MASS, tmp_path, ends) if method != "expert" else None
-    run = changed(small_run(method, demos=demos), changes)
+    data = demos_of(POINT_MASS, tmp_path, ends) if method != "expert" else None
+    run = changed(small_run(method, demos=data), changes)
     if method == "bc":
         run = dataclasses.replace(run, agent=narrow(BC()), frames=1200)
     told = Told()
@@ -176,6 +178,27 @@ def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_
 def test_an_environment_that_does_not_say_so_is_taken_to_end_early_and_the_ten_tasks_do_not() -> None:
     assert envs.ends_early(envs.make(EXIT)) and envs.ends_early(envs.make("toy/reach-v0"))
     assert not envs.ends_early(envs.make("pendulum_swingup"))
-    demos = Demonstrations(EXIT, (), {})
-    run, why = runs.with_absorbing_decided(presets.make(EXIT), demos)
+    run, why = runs.with_absorbing_decided(presets.make(EXIT), Demonstrations(EXIT, (), {}))
     assert run.agent.absorbing and why == f"an episode of {EXIT} may end early"
+
+
+@pytest.mark.parametrize(("steps", "terminated", "n_step", "rows"), [(7, True, 1, 14), (1, True, 3, 4), (7, False, 1, 7)])
+def test_an_early_end_has_as_many_absorbing_steps_as_it_had_steps_before(
+    steps: int, terminated: bool, n_step: int, rows: int
+) -> None:
+    """Else the end of a short demonstration would weigh less than any other state that all demonstrations reach."""
+    episode = Episode(np.zeros((steps + 1, 1), np.float32), np.zeros((steps, 1), np.float32), np.zeros(steps), terminated)
+    run = changed(small_run("expert"), {"agent.absorbing": True, "agent.n_step": n_step})
+    assert len(loop.absorbed(run, episode)) == rows
+    assert loop.absorbed(changed(run, {"agent.absorbing": False}), episode) is episode
+
+
+@pytest.mark.slow
+def test_by_default_imitation_reaches_a_goal_that_ends_the_episode(tmp_path: Path) -> None:
+    """PCIL's rewards are positive, so without the absorbing state it would stay away from the goal."""
+    task, expert = "toy/reach-v0", lambda obs: Reach.optimal_action(obs).astype(np.float32)
+    data = demos.record(expert, envs.make(task), 10, task=task, seed=0, info={}).save(tmp_path / "reach-v0")
+    run = presets.make(task, frames=8000, demos=str(data), evaluate_every=8000, evaluate_episodes=50)
+    runs.execute(run, tmp_path / "run", runs.Silent())
+    last = [row for row in csv.DictReader((tmp_path / "run" / "eval.csv").open()) if int(row["frames"]) >= 8000]
+    assert np.mean([int(row["length"]) < Reach.NUM_STEPS for row in last]) > 0.9

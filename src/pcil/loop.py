@@ -97,7 +97,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
                 _log_pass(state, {}, log, clock)
             else:
                 episode = play(run, env, spec, state)
-                kept = episode.absorbed(run.agent.n_step) if run.agent.absorbing else episode
+                kept = absorbed(run, episode)
                 state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
                 learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
                 state.replay.add(kept, learned if run.label == "stored" else kept.reward)
@@ -249,21 +249,25 @@ def _evaluate(
 
 def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     """The state before the first step."""
-    played = demos
-    if run.agent.absorbing:
-        played, demos = ([episode.absorbed(steps) for episode in demos] for steps in (run.agent.n_step, 1))
-        spec = spec._replace(obs_dim=spec.obs_dim + 1)
+    demos = [absorbed(run, episode) for episode in demos]
+    spec = spec._replace(obs_dim=spec.obs_dim + 1) if run.agent.absorbing else spec
     batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
     fresh = learner.init(run.learner, spec, batches, run.seed)
     replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
     left, reward = run.reward.prefill
-    for episode in itertools.cycle(played):
+    for episode in itertools.cycle(demos):
         if left <= 0:
             break
         replay.add(episode, np.asarray(reward + run.reward.task_weight * episode.reward, np.float32))
         left -= len(episode)
     actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
+
+
+def absorbed(run: Run, episode: Episode) -> Episode:
+    """The episode as the run learns from it: where there is an absorbing state, an early end has as many steps there as it had
+    before, so that half of what a reward sees of it is its end, whatever its length."""
+    return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
 
 
 def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:

@@ -90,7 +90,7 @@ def _made(settings: dict[str, Any]) -> Run:
 
 def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """So many random steps, none twice: the states that the reward reads, the actions, the environment's rewards."""
-    episodes = [episode.absorbed() if run.agent.absorbing else episode for episode in episodes]
+    episodes = [loop.absorbed(run, episode) for episode in episodes]
     part = slice(1, None) if run.reward.reads == "next_obs" else slice(None, -1)
     kinds = zip(*((episode.obs[part], episode.action, episode.reward) for episode in episodes), strict=True)
     chosen = rng.permutation(sum(map(len, episodes)))[:rows]

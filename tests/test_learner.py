@@ -21,7 +21,7 @@ from pcil import envs, learner, loop, runs, seeds
 from pcil.agents import Agent
 from pcil.config import Method, Run
 from pcil.learner import Learner
-from pcil.networks import MLP, Actor, Trunk
+from pcil.networks import Actor, Trunk
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.types import Episode, Spec, Window

@@ -27,8 +27,10 @@ import jax
 import numpy as np
 
 from pcil import checkpoint, learner, loop, presets
+from pcil.agents import BC, DrQV2
 from pcil.compilation import use_cache
 from pcil.config import Run
+from pcil.rewards import REWARDS
 from pcil.types import Episode, Spec
 from small import POINT_MASS, narrow, small_run
 
@@ -105,6 +107,13 @@ def five_updates(run: Run) -> dict[str, Any]:
     return {"metrics": metrics, "sums": sums}
 
 
+def defaults() -> dict[str, Any]:
+    """Every setting's default, by class. A `run.json` of before a setting was there means its default, so one that changes gives
+    old folders another meaning (`pcil.config:Run.plain`)."""
+    kinds = dict.fromkeys([DrQV2, BC, *REWARDS.values()])
+    return {kind.__name__: dataclasses.asdict(kind()) for kind in kinds}
+
+
 def made_by() -> dict[str, Any]:
     """What made the numbers, for whoever finds that they differ."""
     root = Path(__file__).parent.parent
@@ -133,7 +142,9 @@ def main() -> None:
     use_cache()
     numbers = {name: rounded(five_updates(run)) for name, run in cases().items()}
     lines = [f"{json.dumps(name)}: {json.dumps(numbers[name])}" for name in numbers]
-    text = '{"made by": ' + json.dumps(made_by()) + ',\n"cases": {\n' + ",\n".join(lines) + "\n}}\n"
+    settings = [f"{json.dumps(name)}: {json.dumps(values)}" for name, values in defaults().items()]
+    text = '{"made by": ' + json.dumps(made_by()) + ',\n"cases": {\n' + ",\n".join(lines) + "\n},\n"
+    text += '"defaults": {\n' + ",\n".join(settings) + "\n}}\n"
     GOLDEN.write_text(text)
 
 

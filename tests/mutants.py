@@ -36,6 +36,8 @@ OPERATORS = [
     *(f"core/{name}" for name in ("NumberReplacer", "AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue")),
     *(f"core/{name}" for name in ("ReplaceAndWithOr", "ReplaceOrWithAnd", "ZeroIterationForLoop")),
 ]
+SYMMETRIC = {"minimum", "maximum", "min", "max"}
+"""Functions of two arguments that may be swapped."""
 
 
 class Mutant(NamedTuple):
@@ -73,7 +75,12 @@ def edits(text: str, tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
             yield node.value, "None"
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
             yield node, "None"
-        elif isinstance(node, ast.Call) and len(node.args) >= 2 and not any(isinstance(a, ast.Starred) for a in node.args[:2]):
+        elif (
+            isinstance(node, ast.Call)
+            and len(node.args) >= 2
+            and source(node.func).split(".")[-1] not in SYMMETRIC
+            and not any(isinstance(a, ast.Starred) for a in node.args[:2])
+        ):
             first, second = map(source, node.args[:2])
             whole, start = source(node), source(node.func)
             rest = whole[len(start) :].replace(first, "\0", 1).replace(second, first, 1).replace("\0", second, 1)

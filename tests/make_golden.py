@@ -108,8 +108,7 @@ def five_updates(run: Run) -> dict[str, Any]:
 
 
 def defaults() -> dict[str, Any]:
-    """Every setting's default, by class. A `run.json` of before a setting was there means its default, so one that changes gives
-    old folders another meaning (`pcil.config:Run.plain`)."""
+    """Every setting's default, by class: what a `run.json` of before the setting was there means (`pcil.config:Run.plain`)."""
     kinds = dict.fromkeys([DrQV2, BC, *REWARDS.values()])
     return {kind.__name__: dataclasses.asdict(kind()) for kind in kinds}
 

@@ -75,17 +75,18 @@ def edits(text: str, tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
             yield node.value, "None"
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
             yield node, "None"
-        elif (
-            isinstance(node, ast.Call)
-            and len(node.args) >= 2
-            and source(node.func).split(".")[-1] not in SYMMETRIC
-            and not any(isinstance(a, ast.Starred) for a in node.args[:2])
-        ):
+        elif isinstance(node, ast.Call) and swaps(node, source(node.func)):
             first, second = map(source, node.args[:2])
             whole, start = source(node), source(node.func)
             rest = whole[len(start) :].replace(first, "\0", 1).replace(second, first, 1).replace("\0", second, 1)
             if first != second:
                 yield node, start + rest
+
+
+def swaps(call: ast.Call, function: str) -> bool:
+    """Whether a call has two arguments whose order may matter."""
+    two = call.args[:2]
+    return len(two) == 2 and not any(isinstance(a, ast.Starred) for a in two) and function.split(".")[-1] not in SYMMETRIC
 
 
 def mutants(name: str, text: str) -> list[Mutant]:
@@ -159,7 +160,9 @@ def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
 
 def main() -> int:
     table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
-    guards, known = table["guards"], {(e["file"], e["to"]) for e in table.get("equivalent", [])}
+    known = {(e["file"], e["to"]) for e in table["equivalent"]}
+    wider = {"settings": table["settings"]}
+    guards = {name: [test for word in words for test in wider.get(word, [word])] for name, words in table["guards"].items()}
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("files", nargs="*", help=f"from src/pcil without .py: {', '.join(guards)}; a folder means its files")
     parser.add_argument("--number", "-n", type=int, help="how many mutants, drawn at random; by default all of them")

@@ -3,7 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
 
-.PHONY: setup train test test-slow check bench docs format clean
+# make mutants FILES="losses noise" N=200: which changes of the source no test notices (docs/mutants.md)
+.PHONY: setup train test test-slow mutants check bench docs format clean
 
 setup: $(STAMP)
 
@@ -21,6 +22,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow
+
+mutants: $(STAMP)
+	$(BIN)/python tests/mutants.py $(FILES) $(if $(N),--number $(N))
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -90,6 +90,13 @@ def test_info_nce_of_two_anchors_by_hand() -> None:
     assert set(diagnostics) == {"positive_similarity", "negative_similarity", "accuracy"}
 
 
+def test_accuracy_is_the_share_of_anchors_whose_positive_beats_every_negative() -> None:
+    """The first alone does: the second's ties with a negative, the third's and the fourth's are behind one."""
+    positive = jnp.array([0.5, 0.2, 0.9, -0.5])
+    negative = jnp.array([[0.4, -1.0], [0.2, 0.0], [0.8, 0.95], [-0.6, 0.3]])
+    assert float(losses.contrast(positive, negative, 1.0)[1]["accuracy"]) == 0.25
+
+
 @law
 @given(embeddings(), st.sampled_from([0.07, 1.0]))
 def test_info_nce_equals_the_equation_written_out(rows: tuple, temperature: float) -> None:

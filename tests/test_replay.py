@@ -231,6 +231,19 @@ def test_an_episode_that_fills_the_ring_fits_and_one_row_more_is_refused() -> No
     check(replay.sample(np.random.default_rng(0), 5, 9), naive.windows(9), 5, 9)  # and the refusal changed nothing
 
 
+def test_a_replay_of_episodes_holds_them_all_with_their_own_rewards_and_no_row_more() -> None:
+    bare = [make_episode(name, steps, name == 1) for name, steps in enumerate((5, 3, 7))]
+    episodes = [Episode(e.obs, e.action, stored_reward(e), e.terminated) for e in bare]
+    replay, reference = Replay.of(episodes), ListOfEpisodes(18)
+    assert (replay.capacity, replay.num_episodes, replay.num_steps) == (5 + 3 + 7 + 3, 3, 15)
+    for episode in episodes:
+        reference.add(episode)
+    for n in (1, 4):
+        windows = reference.windows(n)
+        drawn = check(replay.sample(np.random.default_rng(0), 500, n), windows, 500, n)
+        assert set(drawn) == set(windows) and replay.num_windows(n) == len(windows)
+
+
 def test_an_empty_replay_has_no_window() -> None:
     replay = Replay(10, 2, 1)
     assert (replay.num_windows(1), replay.num_steps, replay.num_episodes) == (0, 0, 0)

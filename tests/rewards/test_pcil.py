@@ -145,6 +145,33 @@ def test_reference_is_the_last_expert_batch() -> None:
     assert np.array_equal(after.reference, expert.obs[:, 0]) and not np.array_equal(state.reference, expert.obs[:, 0])
 
 
+def test_the_penaltys_partner_is_the_batch_before_and_its_mixtures_are_of_expert_and_agent_rows() -> None:
+    """By one row's gradient at a time: the first update's partners are the random references, the second's its first batch.
+
+    `u` is drawn with the second half of the update's key.
+    """
+    pairs = [[windows(random_batch(33, 6, 1, seed)) for seed in (10 + i, 20 + i)] for i in range(2)]
+    state = SETTINGS.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
+
+    @jax.jit
+    def slopes(encoder: MLP, expert: jnp.ndarray, agent: jnp.ndarray, partner: jnp.ndarray, key: Any) -> jnp.ndarray:
+        u = jax.random.uniform(jax.random.split(key)[1], (32, 1))
+        similarity = lambda x, other: jnp.dot(unit_sphere(encoder(x)), unit_sphere(encoder(other)))  # noqa: E731
+        slope = jax.vmap(jax.grad(similarity))(u * expert + (1 - u) * agent, partner)
+        return jnp.mean((jnp.linalg.norm(slope, axis=1) - 1) ** 2)
+
+    for i, (expert, agent) in enumerate(pairs):
+        key, before = jax.random.key(5 + i), state
+        state, metrics = update(SETTINGS, before, expert, agent, key=key)
+        of = functools.partial(slopes, before.encoder, expert.obs[:, 0], key=key)
+        expected = float(of(agent=agent.obs[:, 0], partner=before.reference))
+        assert float(metrics["penalty"]) == pytest.approx(expected, rel=1e-4)
+        others = (expert.obs[:, 0], before.reference), (agent.obs[:, 0], expert.obs[:, 0])
+        for rows, partner in others:
+            assert float(of(agent=rows, partner=partner)) != pytest.approx(expected, rel=1e-3)
+        assert np.array_equal(state.reference, expert.obs[:, 0])
+
+
 def test_no_anchor_is_its_own_positive() -> None:
     for seed in range(50):
         partner = np.asarray(derangement(jax.random.key(seed), 7))

@@ -1,0 +1,57 @@
+"""Limits of every number among the settings, by hand: both ends are taken, and nothing beyond them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from math import inf
+from typing import Any
+
+import pytest
+
+from pcil.agents import BC, DrQV2
+from pcil.errors import InputError
+from pcil.noise import LinearSchedule
+from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN
+
+LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
+    LinearSchedule(): {"start": (0, inf), "end": (0, inf), "steps": (0, inf)},
+    DrQV2(): {
+        **dict.fromkeys(["batch_size", "n_step", "feature_dim", "hidden"], (1, inf)),
+        **dict.fromkeys(["gamma", "learning_rate", "tau", "noise_correlation"], (0, 1)),
+        "noise_clip": (0, inf),
+    },
+    BC(): {"learning_rate": (0, 1), "deviation": (1e-6, inf), "feature_dim": (1, inf), "hidden": (1, inf)},
+    PCIL(): {
+        **dict.fromkeys(["penalty", "stages", "stage_weight"], (0, inf)),
+        **{"temperature": (1e-6, inf), "penalty_every": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
+        "learning_rate": (0, 1),
+    },
+    TCN(): {"temperature": (1e-6, inf), "window": (1, inf), "margin": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
+    TCN(negatives="rollout", window=3): {"margin": (4, inf), "learning_rate": (0, 1)},
+    DAC(): {"batch_size": (1, inf), "penalty": (0, inf), "hidden": (1, inf), "learning_rate": (0, 1)},
+    PWIL(): {
+        **{"alpha": (1e-6, inf), "beta": (0, inf), "subsampling": (1, inf), "refresh": (1, inf)},
+        **{"prefill_steps": (0, inf), "batch_size": (0, inf), "task_weight": (-inf, inf)},
+    },
+    SIL(): {
+        **dict.fromkeys(["iterations", "batch_size", "hidden", "embedding", "every"], (1, inf)),
+        **{"epsilon": (3e-3, inf), "first_sum": (-inf, 0), "learning_rate": (0, 1)},
+    },
+    POTIL(): {"refresh": (1, inf), "epsilon": (3e-3, inf)},
+}
+"""Least and greatest value of every number that has some, by hand."""
+CASES = [(settings, name, *limits) for settings, numbers in LIMITS.items() for name, limits in numbers.items()]
+
+
+@pytest.mark.parametrize(("settings", "name", "low", "high"), CASES, ids=lambda value: value if isinstance(value, str) else "")
+def test_numbers_are_taken_up_to_their_limits_and_no_further(settings: Any, name: str, low: float, high: float) -> None:
+    whole = isinstance(getattr(settings, name), int)
+    kind, step = (int, 1) if whole else (float, 1e-7)
+    for limit, outside in ((low, low - step), (high, high + step)):
+        if abs(limit) == inf:
+            dataclasses.replace(settings, **{name: kind(math.copysign(1e6, limit))})
+        else:
+            dataclasses.replace(settings, **{name: kind(limit)})
+            with pytest.raises(InputError, match=rf"\.{name} is .* it must be"):
+                dataclasses.replace(settings, **{name: kind(outside)})

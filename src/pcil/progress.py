@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
@@ -57,17 +58,21 @@ class Screen(Console):
 class Signals:
     """While it is entered, the first Ctrl-C, SIGTERM or SIGHUP is kept and answered; a second Ctrl-C stops at once.
 
-    A SIGHUP that is ignored, as under nohup, stays ignored.
+    A SIGHUP that is ignored, as under nohup, stays ignored. Of other threads than the main one Python takes no handlers, so
+    there all stays as it is.
     """
 
-    def __init__(self, answer: Callable[[], None]) -> None:
+    def __init__(self, answer: Callable[[], None], *numbers: int) -> None:
+        """`numbers` are the signals, by default these three."""
         self.number: int | None = None
-        self._answer = answer
+        self._answer, self._numbers = answer, set(numbers)
 
     def __enter__(self) -> Signals:
-        numbers = {signal.SIGINT, signal.SIGTERM}
-        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-            numbers.add(signal.SIGHUP)
+        numbers = self._numbers or {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+        if threading.current_thread() is not threading.main_thread():
+            numbers = set()
+        elif signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+            numbers = numbers - {signal.SIGHUP}
         self._before = {number: signal.signal(number, self._ask) for number in numbers}
         return self
 

@@ -8,17 +8,21 @@ import fcntl
 import json
 import os
 import platform
+import signal
 import subprocess
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from pcil import compilation, envs, loop, presets
+import gymnasium
+
+from pcil import compilation, envs, loop, presets, progress
 from pcil.config import Run, completed, differences
 from pcil.demos import Demonstrations
-from pcil.errors import InputError
+from pcil.errors import InputError, RunError, brief
 from pcil.evaluate import Evaluation
 from pcil.policy import Policy, load_policy
 
@@ -58,33 +62,93 @@ class Silent:
 
 
 def train(
-    task: str,
+    task: Any,
     *,
     out: str | Path,
     method: str = "pcil",
     preset: str = "default",
+    demos: Any = None,
     reporter: loop.Reporter | None = None,
     **changes: Any,
 ) -> Result:
     """Train a policy in the folder `out`, or resume or report what is there.
 
-    `changes` are fields of `Run` (`seed=1`, `frames=200_000`, `demos=...`). Raises `InputError` where something given is
-    wrong, and `loop.Stopped` where the reporter asks to stop.
+    `task` is a task's name, a function that makes a new environment at each call, or an environment, which is then the run's
+    single one and is not closed. `demos` are `Demonstrations`, or the name or path of some. `changes` are fields of `Run`
+    (`seed=1`, `frames=200_000`).
+
+    Raises `InputError` where something given is wrong, `RunError` where the environment fails or training diverges, and
+    `loop.Stopped` where the reporter asks to stop. The first Ctrl-C ends the run after the episode at hand and saves it before
+    `KeyboardInterrupt` is raised; a second one raises it at once.
     """
+    if not isinstance(out, (str, os.PathLike)):
+        raise InputError(f"out is {brief(out)}; it must be the path of a folder.")
+    if demos is not None and not isinstance(demos, (str, os.PathLike, Demonstrations)):
+        raise InputError(
+            f"demos is {brief(demos)}; it must be a shipped task, the path or id of a Minari dataset, or pcil.Demonstrations."
+        )
+    given = demos if isinstance(demos, Demonstrations) else None
     changes = {name: value for name, value in changes.items() if value is not None}
-    return execute(presets.make(envs.task_name(task), method, preset, **changes), Path(out), reporter or Silent())
+    if demos is not None:
+        changes["demos"] = brief(given) if given else os.fspath(demos)
+    if isinstance(task, gymnasium.Env):
+        changes["single_environment"] = True
+    run = presets.make(envs.task_name(task), method, preset, **changes)
+    with progress.Signals(lambda: None, signal.SIGINT) as signals:
+        listener = _Interruptible(reporter or Silent(), signals)
+        try:
+            result = execute(run, Path(out), listener, task=task, demos=given)
+        except loop.Stopped:
+            if signals.number is None:
+                raise
+            raise KeyboardInterrupt from None
+    if signals.number is not None:
+        raise KeyboardInterrupt
+    return result
 
 
-def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
-    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
+class _Interruptible:
+    """A reporter that also asks to stop where a signal did."""
+
+    def __init__(self, reporter: loop.Reporter, signals: progress.Signals) -> None:
+        self.episode, self.evaluation, self.say = reporter.episode, reporter.evaluation, reporter.say
+        self._stop, self._signals = reporter.stop, signals
+
+    def stop(self) -> bool:
+        return self._stop() or self._signals.number is not None
+
+
+def execute(
+    run: Run, folder: Path, reporter: loop.Reporter, *, task: Any = None, demos: Demonstrations | None = None
+) -> Result:
+    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference.
+
+    `task` and `demos` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
+    """
     compilation.use_cache()
-    folder, demos = folder.expanduser(), demonstrations(run)
+    folder, demos = folder.expanduser(), demonstrations(run, task, demos)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
-            final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter).counters.final_return
+            (folder / "error.txt").unlink(missing_ok=True)
+            with _traceback_kept(folder / "error.txt"):
+                final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter, task).counters.final_return
             _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
+
+
+@contextlib.contextmanager
+def _traceback_kept(path: Path) -> Iterator[None]:
+    """Where an environment raises, its traceback goes to a file that the error names."""
+    try:
+        yield
+    except RunError as error:
+        if error.__cause__ is None:
+            raise
+        path.write_text("".join(traceback.format_exception(error.__cause__)))
+        raise RunError(
+            f"{str(error).removesuffix('.')}; its traceback is in {path}, and the same command goes on from the episode before."
+        ) from error.__cause__
 
 
 def read_done(folder: Path) -> float:
@@ -97,10 +161,13 @@ def read_done(folder: Path) -> float:
         ) from error
 
 
-def demonstrations(run: Run) -> Demonstrations | None:
-    """What the run imitates, checked against its environment, or None where it needs no demonstrations."""
-    environment = envs.make(run.task)
-    limit = environment.spec and environment.spec.max_episode_steps
+def demonstrations(run: Run, task: Any = None, given: Demonstrations | None = None) -> Demonstrations | None:
+    """What the run imitates, checked against its environment, or None where it needs no demonstrations.
+
+    `task` and `given` stand in for what `run.task` and `run.demos` name.
+    """
+    with envs.opened(run.task if task is None else task) as environment:
+        spec, limit = envs.spec(environment), environment.spec and environment.spec.max_episode_steps
     if limit and limit >= run.replay_steps:
         raise InputError(
             f"The replay has {run.replay_steps} rows, and an episode of {run.task} may take {limit + 1}; enlarge it."
@@ -108,7 +175,7 @@ def demonstrations(run: Run) -> Demonstrations | None:
     if not run.reward.needs_demos and not run.agent.offline:
         return None
     source = run.task if run.demos is None else run.demos
-    demos = Demonstrations.load(source).take(run.num_demos).validate(envs.spec(environment))
+    demos = (given or Demonstrations.load(source)).take(run.num_demos).validate(spec)
     steps = max(run.reward.span if run.reward.batch_size else 1, run.agent.n_step if run.agent.offline else 1)
     if all(len(episode) < steps and not episode.terminated for episode in demos.episodes):
         raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import gymnasium
@@ -140,7 +140,7 @@ def _made(task: Any, render_mode: str | None) -> gymnasium.Env:
         raise InputError(f"The environment {task!r} can't be made ({type(error).__name__}: {error}).") from error
 
 
-def _returned(function: Callable[[], Any]) -> gymnasium.Env:
+def _returned(function: Any) -> gymnasium.Env:
     """The environment that a function makes."""
     name = task_name(function)
     try:

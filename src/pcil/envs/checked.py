@@ -13,6 +13,7 @@ from gymnasium import spaces
 
 from pcil.errors import InputError, RunError, brief
 
+_FLOAT32 = np.dtype(np.float32)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -68,7 +69,8 @@ class Checked(gymnasium.Wrapper):
         return self._observation(result[0]), dict(result[1] or {})
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Any]:
-        action = self.checked_action(action)
+        if not self._is_plain(action, self._action_shape):
+            action = self.checked_action(action)
         self._steps += 1
         if self._longest is not None and self._steps > self._longest:
             raise InputError(
@@ -89,7 +91,7 @@ class Checked(gymnasium.Wrapper):
         if not isinstance(result, (tuple, list)) or len(result) != 5:
             raise self._refused(result, "from step", "(observation, reward, terminated, truncated, info)")
         obs, reward, terminated, truncated, info = result
-        row = self._observation(obs)
+        row = obs.copy() if self._is_plain(obs, self._shape) else self._observation(obs)
         if type(reward) is not float or not -_LARGEST <= reward <= _LARGEST:
             reward = self._reward(reward)
         if type(terminated) is not bool:
@@ -107,19 +109,25 @@ class Checked(gymnasium.Wrapper):
 
     def _observation(self, obs: Any) -> np.ndarray:
         """A flat float32 copy: the environment may reuse its buffer."""
-        if type(obs) is np.ndarray and obs.shape == self._shape and obs.dtype == np.float32:
-            row = obs.copy()
-        else:
-            with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
-                parts = [part.ravel().astype(np.float32) for _, part in self._parts(self._inner_space, obs, "observation")]
+        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
+            parts = [part.ravel().astype(np.float32) for _, part in self._parts(self._inner_space, obs, "observation")]
             row = np.concatenate(parts)
-        if _finite(row):
-            return row
-        with np.errstate(over="ignore"):
+            if np.isfinite(row).all():
+                return row
             for path, part in self._parts(self._inner_space, obs, "observation"):
                 if where := np.argwhere(~np.isfinite(part.astype(np.float32))).tolist():
                     raise self._not_finite(part[tuple(where[0])], f"returned an {path} whose {_entry(where[0])}")
         raise AssertionError("a part of what is not finite is not finite")
+
+    @staticmethod
+    def _is_plain(array: Any, shape: tuple[int, ...] | None) -> bool:
+        """Whether it is what nearly all are, a finite float32 vector of this shape: a quick test in each step.
+
+        The sum of squares is infinite for large finite values too, which the slower test of all else then takes.
+        """
+        if type(array) is not np.ndarray or array.dtype is not _FLOAT32 or array.shape != shape:
+            return False
+        return math.isfinite(sum(array.tolist()) if array.size < 16 else np.vdot(array, array))
 
     def _parts(self, space: spaces.Space, value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
         """The array of each Box in a space, with the path to it, in the order in which Gymnasium flattens them."""
@@ -158,13 +166,13 @@ class Checked(gymnasium.Wrapper):
 
     def checked_action(self, action: Any) -> np.ndarray:
         """An action for the next step; `InputError` if it is of another shape or no numbers, `RunError` if it is not finite."""
-        array = action if type(action) is np.ndarray and action.dtype.kind == "f" else _numbers(action)
+        array = _numbers(action)
         if array is None or array.shape != self._action_shape:
             raise InputError(
                 f"The action for {self._name!r} is {brief(action)}, {self._place(1)}; it must be real numbers of shape "
                 f"{self._action_shape}."
             )
-        if not _finite(array):
+        if not np.isfinite(array).all():
             where = np.argwhere(~np.isfinite(array)).tolist()[0]
             raise self._not_finite(array[tuple(where)], f"was to be given an action whose {_entry(where)}", 1)
         return array
@@ -176,9 +184,8 @@ class Checked(gymnasium.Wrapper):
         return f"{f'in step {step}' if step else 'at the start'} of {self.episode or f'episode {self._episodes}'}{seed}"
 
     def _refused(self, value: Any, how: str, expected: str) -> InputError:
-        return InputError(
-            f"The environment {self._name!r} returned {brief(value)} {how}, {self._place()}; it must be {expected}."
-        )
+        said = f"{len(value)} values" if how.startswith("from") and isinstance(value, (tuple, list)) else brief(value)
+        return InputError(f"The environment {self._name!r} returned {said} {how}, {self._place()}; it must be {expected}.")
 
     def _not_finite(self, value: Any, whose: str, ahead: int = 0) -> RunError:
         wide = ", too large for float32" if np.isfinite(value) else ""
@@ -209,11 +216,6 @@ def _numbers(value: Any) -> np.ndarray | None:
     return None if array.dtype.kind not in "fiub" or np.ma.is_masked(value) else array
 
 
-def _finite(array: np.ndarray) -> bool:
-    """Whether all is finite; the sum of squares is a quick test, which large finite values fail too."""
-    return math.isfinite(np.vdot(array, array)) or bool(np.isfinite(array).all())
-
-
 def _entry(where: list[int]) -> str:
     return f"entry {where[0] if len(where) == 1 else tuple(where)}" if where else "value"
 
@@ -224,7 +226,8 @@ def _listed(keys: Any) -> str:
 
 def _said(error: BaseException) -> str:
     """Type and message of an error, on one line."""
-    return f"{type(error).__name__} ({' '.join(str(error).split())})" if str(error).strip() else type(error).__name__
+    text = " ".join(str(error).split()).removesuffix(".")
+    return f"{type(error).__name__} ({text})" if text else type(error).__name__
 
 
 def _raised_in_gymnasium(error: BaseException) -> bool:

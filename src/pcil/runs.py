@@ -64,9 +64,9 @@ class Silent:
 def train(
     task: Any,
     *,
-    out: str | Path,
-    method: str = "pcil",
-    preset: str = "default",
+    out: Any,
+    method: Any = "pcil",
+    preset: Any = "default",
     demos: Any = None,
     reporter: loop.Reporter | None = None,
     **changes: Any,

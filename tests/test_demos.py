@@ -325,11 +325,9 @@ def test_nested_dicts_and_tuples_are_flattened_as_the_environment_is(tmp_path: P
     env = envs.checked(Odd(space))
     env.reset(seed=3)
     raw = [env.unwrapped._observation() for env.unwrapped.x in (0.25, 0.5, 0.75, 1.0)]
-    stacked = [
-        np.stack(column) for column in zip(*([o[0], o[1]["z"], o[1]["a"][0], o[1]["a"][1]["y"]] for o in raw), strict=True)
-    ]
-    deepest = np.stack([o[1]["a"][1]["b"] for o in raw])
-    stored = (stacked[0], {"z": stacked[1], "a": (stacked[2], {"y": stacked[3], "b": deepest})})
+    parts = [(o[0], o[1]["z"], o[1]["a"][0], o[1]["a"][1]["y"], o[1]["a"][1]["b"]) for o in raw]
+    first, z, a, y, b = (np.stack(part) for part in zip(*parts, strict=True))
+    stored = (first, {"z": z, "a": (a, {"y": y, "b": b})})
     loaded = Demonstrations.load(write_foreign(tmp_path / "place", space, TWO, stored, ACTIONS)).episodes[0].obs
     env.unwrapped._observation = lambda: raw.pop(0)
     np.testing.assert_array_equal(loaded, [env.reset()[0], *(env.step(np.zeros(1))[0] for _ in range(3))])

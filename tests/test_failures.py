@@ -9,7 +9,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import jax
@@ -20,7 +20,7 @@ import pcil
 from odd import Odd, raising
 from pcil import checkpoint, cli, demos, envs, learner, loop, presets, runs
 from pcil.config import Run
-from pcil.errors import InputError, RunError
+from pcil.errors import InputError, RunError, check_kinds
 from pcil.types import Spec
 from small import random_batch, small_run, windows
 from test_loop import StopAfter, finish, rows, same_run
@@ -111,15 +111,11 @@ def test_a_failure_in_an_evaluation_loses_nothing_either(tmp_path: Path) -> None
 
 def test_the_command_line_says_one_sentence_and_exits_with_1(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     register(step=raising(RuntimeError("the motor\nis hot")), episode=1)
-    words = (
-        f"train {ID} --method expert --frames 60 --seed-frames 20 --random-frames 20 --evaluate-episodes 2 --agent.hidden 16 "
-    )
-    words += "--agent.batch-size 32 --agent.feature-dim 8 --out run"
-    assert cli.main(words.split()) == 1
+    words = f"train {ID} --method expert --frames 60 --seed-frames 20 --random-frames 20 --evaluate-episodes 2 --out run"
+    assert cli.main([*words.split(), "--agent.hidden", "16", "--agent.batch-size", "32", "--agent.feature-dim", "8"]) == 1
     out, err = capsys.readouterr()
-    assert err.count("\n") == 1 and err.startswith(
-        f"pcil: The environment '{ID}' raised RuntimeError (the motor is hot), in step 3"
-    )
+    assert err.count("\n") == 1
+    assert err.startswith(f"pcil: The environment '{ID}' raised RuntimeError (the motor is hot), in step 3")
     assert "Traceback" not in out + err
     Flaky.broken = False
     finish(odd_run(), tmp_path / "done")
@@ -153,7 +149,7 @@ def updated(reward: list[float], label: str = "stored", obs: list[float] | None 
 def test_what_left_the_finite_range_first_is_named_with_its_update() -> None:
     assert learner.first_not_finite(updated([0.0, 1.0, 2.0])) is None
     assert learner.first_not_finite(updated([0.0, NAN, 0.0])) == ("the rewards of the batch", 1)
-    assert learner.first_not_finite(updated([0.0, 0.0, 1e38, 0.0])) == ("agent/critic_loss", 2)
+    assert learner.first_not_finite(updated([0.0, 0.0, 1e30, 0.0])) == ("agent/critic_loss", 2)
     what, update = learner.first_not_finite(updated([0.0, 0.0, 0.0], "sampled", obs=[1.0, 1.0, NAN])) or ("", -1)
     assert what.startswith("reward/") and "agent" not in what and update == 2
 
@@ -185,14 +181,10 @@ def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(off
         recorded = demos.record(lambda obs: np.ones(1), Odd(), 2, task=ID, seed=0, info={})
         Odd.open_copies[0].close()
         huge = [dataclasses.replace(episode, action=episode.action * np.float32(1e30)) for episode in recorded.episodes]
-        with pytest.raises(
-            RunError, match=rf"training on {ID} diverged: agent/loss and agent/squared_error became .* update 1,"
-        ):
+        with pytest.raises(RunError, match=f"training on {ID} diverged: agent/loss and agent/squared_error became .*update 1,"):
             loop.train_loop(dataclasses.replace(run, seed_frames=0), tmp_path, huge, runs.Silent())
     else:
-        with pytest.raises(
-            RunError, match=rf"training on {ID} diverged: agent/critic_loss became NaN or infinite in update \d+,"
-        ):
+        with pytest.raises(RunError, match=rf"training on {ID} diverged: agent/critic_loss became .* in update \d+,"):
             runs.execute(run, tmp_path, runs.Silent())
     no_value_is_missing(tmp_path)
 
@@ -310,17 +302,43 @@ def test_demonstrations_may_be_given_as_they_are_or_by_path(tmp_path: Path) -> N
         ({"demos": np.zeros(10**6)}, r"demos is an array of shape \(1000000,\) and dtype float64; it must be a shipped task"),
         ({"demos": [np.zeros(10**6)] * 99}, r"demos is \[array"),
         ({"out": None}, "out is None; it must be the path of a folder"),
-        ({"seed": np.zeros(10**6)}, r"Run.seed is an array of shape \(1000000,\)"),
-        ({"label": np.zeros(10**6)}, r"Run.label is an array of shape \(1000000,\)"),
         ({"method": np.zeros(10**6)}, r"There is no method an array of shape"),
-        ({"agent": {"a": np.zeros(10**6)}}, r"Run.agent is \{'a': array"),
-        ({"frames": "9" * 10**6}, "Run.frames is '9999"),
     ],
 )
 def test_anything_else_is_one_short_sentence(given: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said) as error:
         pcil.train(**{"task": "walker_walk", "out": tmp_path / "run", **given})
     assert len(str(error.value)) < 250 and not (tmp_path / "run").exists()
+
+
+@dataclasses.dataclass
+class Settings:
+    """Fields of each kind."""
+
+    text: str = ""
+    number: int = 0
+    word: Literal["a", "b"] = "a"
+    path: Path | None = None
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        (
+            "number",
+            np.zeros(10**6),
+            r"is an array of shape \(1000000,\) and dtype float64; it must be a whole",
+        ),
+        ("word", np.zeros(10**6), r"Settings.word is an array of shape \(1000000,\)"),
+        ("text", {"a": np.zeros(10**6)}, r"Settings.text is \{'a': array"),
+        ("number", "9" * 10**6, "Settings.number is '9999"),
+        ("path", Path, "Settings.path is an object of class builtins.type; it must be of class Path or None"),
+    ],
+)
+def test_settings_of_another_kind_are_shown_shortened(field: str, value: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as error:
+        check_kinds(dataclasses.replace(Settings(), **{field: value}))
+    assert len(str(error.value)) < 150
 
 
 class CtrlC(runs.Silent):

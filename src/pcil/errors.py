@@ -32,7 +32,8 @@ def brief(value: Any) -> str:
     if isinstance(shape, tuple) and not isinstance(value, numbers.Number):
         return f"an array of shape {shape} and dtype {getattr(value, 'dtype', 'unknown')}"
     if value is None or isinstance(value, (str, bytes, numbers.Number, list, tuple, dict, set)):
-        return reprlib.repr(value)
+        text = reprlib.repr(value)
+        return text if len(text) <= 80 else f"{text[:77]}..."
     return f"an object of class {type(value).__module__}.{type(value).__qualname__}"
 
 

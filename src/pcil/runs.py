@@ -88,9 +88,8 @@ def train(
             f"demos is {brief(demos)}; it must be a shipped task, the path or id of a Minari dataset, or pcil.Demonstrations."
         )
     given = demos if isinstance(demos, Demonstrations) else None
-    changes = {name: value for name, value in changes.items() if value is not None}
-    if demos is not None:
-        changes["demos"] = brief(given) if given else os.fspath(demos)
+    named = brief(demos) if isinstance(demos, Demonstrations) else demos and os.fspath(demos)
+    changes = {name: value for name, value in {**changes, "demos": named}.items() if value is not None}
     if isinstance(task, gymnasium.Env):
         changes["single_environment"] = True
     run = presets.make(envs.task_name(task), method, preset, **changes)

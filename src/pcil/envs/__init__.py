@@ -193,8 +193,7 @@ def _refuse_name(task: str, error: Exception) -> NoReturn:
 
 def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
     space = env.action_space
-    flat = isinstance(space, spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0
-    if not flat or not np.issubdtype(space.dtype, np.floating):
+    if not isinstance(space, spaces.Box) or space.shape in ((), (0,)) or len(space.shape) > 1 or space.dtype.kind != "f":
         raise InputError(f"The actions of {task!r} must be a flat Box of real numbers; they are {space}.")
     if not space.is_bounded():
         raise InputError(f"The actions of {task!r} must have finite bounds; they are {space}.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -37,7 +38,7 @@ class Checked(gymnasium.Wrapper):
                 f"The observations of {name!r} must be a Box or a Dict of Boxes, or Dicts and Tuples of these, and hold a "
                 f"number; they are {space}."
             )
-        flat = spaces.flatten_space(space)
+        flat: Any = spaces.flatten_space(space)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
             self.observation_space = spaces.Box(flat.low, flat.high, flat.shape, np.float32)
@@ -58,7 +59,7 @@ class Checked(gymnasium.Wrapper):
         except InputError:
             raise
         except (Exception, SystemExit) as error:  # the environment is anybody's
-            if isinstance(error, TypeError) and "unexpected keyword" in str(error):
+            if isinstance(error, TypeError) and re.search("unexpected keyword argument '(seed|options)'", str(error)):
                 raise InputError(
                     f"The environment {self._name!r} can't be reset with a seed ({error}); its reset must take the keywords "
                     "seed and options."

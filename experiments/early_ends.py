@@ -30,8 +30,9 @@ def main() -> None:
             shares = []
             for seed in SEEDS:
                 out = FOLDER / method / ("default" if absorbing is None else "off") / str(seed)
-                run = pcil.train(TASK, method=method, seed=seed, frames=20_000, demos=str(dataset), out=out, **settings)
-                result = evaluate(run.policy, environments_for(TASK, EPISODES), seed=0, episodes=EPISODES)
+                run = pcil.train(TASK, method=method, seed=seed, frames=30_000, demos=str(dataset), out=out, **settings)
+                with environments_for(TASK, EPISODES) as copies:
+                    result = evaluate(run.policy, copies, seed=0, episodes=EPISODES)
                 shares.append(float(np.mean(result.lengths < Reach.NUM_STEPS)))
             print(f"{method:5} absorbing {'default' if absorbing is None else 'off':8}", *(f"{share:6.0%}" for share in shares))
 

@@ -25,7 +25,8 @@ from hypothesis import strategies as st
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 
-from pcil import demos, seeds
+from odd import Odd
+from pcil import demos, envs, seeds
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
 from pcil.types import Episode, Spec
@@ -316,6 +317,22 @@ def test_dict_observations_are_flattened_as_gymnasium_does_it(tmp_path: Path, ki
     assert (loaded.task, loaded.episodes[0].seed) == ("other/place-v0", 7)
     assert loaded.info["minari_version"] == minari.__version__
     assert Demonstrations.load(loaded.save(tmp_path / "again")).info == loaded.info
+
+
+def test_nested_dicts_and_tuples_are_flattened_as_the_environment_is(tmp_path: Path) -> None:
+    image = spaces.Box(0, 9, (2, 2), np.float32)
+    space = spaces.Tuple([image, spaces.Dict(z=BOX, a=spaces.Tuple([BOX, spaces.Dict(y=image, b=BOX)]))])
+    env = envs.checked(Odd(space))
+    env.reset(seed=3)
+    raw = [env.unwrapped._observation() for env.unwrapped.x in (0.25, 0.5, 0.75, 1.0)]
+    parts = [(o[0], o[1]["z"], o[1]["a"][0], o[1]["a"][1]["y"], o[1]["a"][1]["b"]) for o in raw]
+    first, z, a, y, b = (np.stack(part) for part in zip(*parts, strict=True))
+    stored = (first, {"z": z, "a": (a, {"y": y, "b": b})})
+    loaded = Demonstrations.load(write_foreign(tmp_path / "place", space, TWO, stored, ACTIONS)).episodes[0].obs
+    env.unwrapped._observation = lambda: raw.pop(0)
+    np.testing.assert_array_equal(loaded, [env.reset()[0], *(env.step(np.zeros(1))[0] for _ in range(3))])
+    assert np.array_equal(np.unique(loaded[:, 0]), [0.25, 0.5, 0.75, 1.0])
+    env.close()
 
 
 @pytest.mark.filterwarnings("ignore:.*precision lowered by casting")

@@ -75,7 +75,8 @@ def test_in_lockstep_as_one_by_one(lengths: tuple[int, ...]) -> None:
     assert result.seconds > 0
 
 
-def test_only_those_still_running_are_asked_for_an_action() -> None:
+def test_an_episode_keeps_its_row_of_the_block_until_all_are_over() -> None:
+    """A matrix product of fewer rows may differ in the last bit."""
     asked = []
 
     def act(obs: np.ndarray) -> np.ndarray:
@@ -83,7 +84,10 @@ def test_only_those_still_running_are_asked_for_an_action() -> None:
         return policy(obs)
 
     evaluate(act, walks(3, 1, 4), seed=0)
-    assert asked == [[3, 1, 4], [2, 3], [1, 2], [1]]  # the steps that each running episode has left
+    assert asked == [[3, 1, 4], [2, 0, 3], [1, 0, 2], [0, 0, 1]]  # the steps that each episode has left
+    asked.clear()
+    evaluate(act, walks(2), seed=0, episodes=3)
+    assert asked == [[2, 0, 0], [1, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 2], [0, 0, 1]]
 
 
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others() -> None:
@@ -116,7 +120,9 @@ def test_fewer_environments_than_episodes_take_them_in_turns() -> None:
     result = evaluate(policy, turns, seed=4, episodes=7)
     assert (result.returns.tolist(), result.lengths.tolist()) == (returns, lengths)
     assert [len(env.seeds) for env in turns] == [4, 3]
-    assert len(environments_for("toy/point_mass-v0", 1000)) == LOCKSTEP and len(environments_for("toy/point_mass-v0", 2)) == 2
+    for episodes, single, copies in ((1000, False, LOCKSTEP), (2, False, 2), (2, True, 1)):
+        with environments_for("toy/point_mass-v0", episodes, single=single) as made:
+            assert len(made) == copies
 
 
 def test_an_environment_may_reuse_its_buffer() -> None:

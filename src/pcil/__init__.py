@@ -13,7 +13,18 @@ import importlib
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["Demonstrations", "Episode", "InputError", "Policy", "Reward", "load_policy", "make_env", "record", "train"]
+__all__ = [
+    "Demonstrations",
+    "Episode",
+    "InputError",
+    "Policy",
+    "Reward",
+    "RunError",
+    "load_policy",
+    "make_env",
+    "record",
+    "train",
+]
 
 _HOME = {
     "Demonstrations": ("pcil.demos", "Demonstrations"),
@@ -21,6 +32,7 @@ _HOME = {
     "InputError": ("pcil.errors", "InputError"),
     "Policy": ("pcil.policy", "Policy"),
     "Reward": ("pcil.rewards", "Reward"),
+    "RunError": ("pcil.errors", "RunError"),
     "load_policy": ("pcil.policy", "load_policy"),
     "make_env": ("pcil.envs", "make"),
     "record": ("pcil.demos", "record"),

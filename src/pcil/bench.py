@@ -47,13 +47,14 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     compilation.start()
     timing = measure_env(task)
     imitation, alone = (presets.make(task, method, preset) for method in ("pcil", "expert"))
-    env = envs.make(imitation.task)
+    with envs.opened(imitation.task) as env:
+        spec = envs.spec(env)
     parts = {}
     for name, run in (("", imitation), ("agent_", alone)):
-        setup = Setup(run, envs.spec(env))
+        setup = Setup(run, spec)
         parts[f"{name}update_ms"] = setup.update
         parts[f"{name}floor_ms"] = setup.floor
-    setup = Setup(imitation, envs.spec(env))
+    setup = Setup(imitation, spec)
     parts |= {"act_us": setup.act, "sample_us": setup.sample}
     figures = medians(parts, seconds / 2)
     figures |= {name: timing[name] for name in ("env_step_us", "physics_us")}
@@ -87,7 +88,7 @@ class Setup:
         import numpy as np
 
         from pcil import learner
-        from pcil.loop import on_host
+        from pcil.learner import on_host
         from pcil.replay import Replay
         from pcil.types import Batch, Episode
 

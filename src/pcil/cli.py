@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; 0 on success, 2 on bad input, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
+    """Run one command; 0 on success, 2 on bad input, 1 where a run failed, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
     # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "" not in sys.path:
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         sentence = " ".join(str(error).split())  # what a library said may have line breaks
         print(f"pcil: {shown(sentence.removesuffix('.'))}.", file=sys.stderr)
-        return 2
+        return error.exit_code
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
@@ -120,6 +120,7 @@ def _evaluate(words: list[str]) -> int:
         episodes: int = 10,
         seed: int = 0,
         env_kwargs: EnvKwargs | None = None,
+        single_environment: bool = False,
         json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
     ) -> int:
         """Roll out the policy of a run, without exploration.
@@ -129,6 +130,7 @@ def _evaluate(words: list[str]) -> int:
             episodes: How many.
             seed: The episodes' starts follow from it.
             env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
+            single_environment: Play one episode after the other in one environment: slower, with the same results.
             json_output: Print one JSON object and nothing else.
         """
         from pcil.evaluate import environments_for
@@ -139,8 +141,9 @@ def _evaluate(words: list[str]) -> int:
         _at_least(0, seed=seed)
         policy = load_policy(folder)
         arguments = policy.env_kwargs if env_kwargs is None else env_kwargs
-        with contextlib.redirect_stdout(sys.stderr):  # an environment may print
-            result = roll_out(policy, environments_for(policy.task, episodes, arguments), seed=seed, episodes=episodes)
+        copies = environments_for(policy.task, episodes, arguments, single=single_environment)
+        with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
+            result = roll_out(policy, made, seed=seed, episodes=episodes)
         row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
         row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
         if json_output:
@@ -208,15 +211,9 @@ def _record(words: list[str]) -> int:
         least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
         least += "" if env_kwargs is None else f" --env-kwargs '{json.dumps(env_kwargs)}'"
         info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed}{least} --out {out}")
-        recorded = demos.record(
-            policy,
-            envs.make(policy.task, env_kwargs=policy.env_kwargs if env_kwargs is None else env_kwargs),
-            episodes,
-            task=policy.task,
-            seed=seed,
-            minimum_return=minimum_return,
-            info=info,
-        )
+        asked: Any = {"task": policy.task, "seed": seed, "minimum_return": minimum_return, "info": info}
+        with envs.opened(policy.task, env_kwargs=policy.env_kwargs if env_kwargs is None else env_kwargs) as env:
+            recorded = demos.record(policy, env, episodes, **asked)
         path = recorded.save(out)
         returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
         print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {path}")

@@ -14,7 +14,7 @@ from pcil.agents import Agent, DrQV2
 from pcil.errors import InputError, check_kinds, check_ranges, json_object
 from pcil.rewards import PCIL, Reward
 
-MACHINE_SETTINGS = ("checkpoint_seconds",)
+MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
 """Settings that change no result, so a run may resume with others."""
 EnvKwargs = Annotated[
     dict[str, Any],
@@ -83,6 +83,8 @@ class Run:
     """Episodes of an evaluation."""
     checkpoint_seconds: float = 120.0
     """Least time from one checkpoint to the next; a checkpoint is written between episodes, and when the run stops."""
+    single_environment: bool = False
+    """Open one environment at a time and evaluate in it too, one episode after the other: slower, with the same results."""
 
     def __post_init__(self) -> None:
         check_kinds(self)

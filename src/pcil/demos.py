@@ -204,8 +204,9 @@ def record(
         raise InputError(f"{episodes} episodes were asked for, but at least 1 must be recorded.")
     if minimum_return is not None and not minimum_return < math.inf:
         raise InputError(f"The minimum return is {minimum_return}; it must be a number that an episode can reach.")
-    kept: list[Episode] = []
+    env, kept = envs.checked(env), []
     for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
+        env.episode = f"recorded episode {attempt + 1}"
         episode = _rollout(policy, env, seeds.episode_seed(seed, seeds.Stream.RECORD, attempt))
         if minimum_return is None or episode.total_reward >= minimum_return:
             kept.append(_in_unit_box(episode, env.action_space))
@@ -218,15 +219,17 @@ def record(
     )
 
 
-def _rollout(policy: Callable[[np.ndarray], Any], env: gymnasium.Env, seed: int) -> Episode:
-    observations, actions, rewards = [np.array(env.reset(seed=seed)[0], np.float32)], [], []
+def _rollout(policy: Callable[[np.ndarray], Any], env: envs.Checked, seed: int) -> Episode:
+    observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
     terminated = truncated = False
     while not (terminated or truncated):
-        actions.append(np.array(policy(observations[-1]), np.float32))
-        obs, reward, terminated, truncated, _ = env.step(actions[-1])
-        observations.append(np.array(obs, np.float32))  # a copy: the environment may reuse its buffer
-        rewards.append(float(reward))
-    return Episode(np.stack(observations), np.stack(actions), np.array(rewards), bool(terminated), seed)
+        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
+            action = env.checked_action(policy(observations[-1])).astype(np.float32)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        observations.append(obs)
+        actions.append(action)
+        rewards.append(reward)
+    return Episode(np.stack(observations), np.stack(actions), np.array(rewards), terminated, seed)
 
 
 def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:

@@ -67,9 +67,9 @@ def _devices() -> str:
 def _environment() -> str:
     from pcil import envs
 
-    env = envs.make("pendulum_swingup")
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
+    with envs.opened("pendulum_swingup") as env:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
     return "pendulum_swingup steps"
 
 
@@ -96,9 +96,9 @@ def _cache() -> str:
 def _rendering() -> str:
     from pcil import envs
 
-    env = envs.make("pendulum_swingup", render_mode="rgb_array")
-    env.reset(seed=0)
-    frame = env.render()
+    with envs.opened("pendulum_swingup", render_mode="rgb_array") as env:
+        env.reset(seed=0)
+        frame = env.render()
     return f"frames of {getattr(frame, 'shape', None)} with MUJOCO_GL={os.environ.get('MUJOCO_GL', 'default')}"
 
 

@@ -1,4 +1,4 @@
-"""The one error that is a person's to mend, and the checks of settings that raise it."""
+"""The errors that are shown as one sentence, and the checks of settings that raise them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,36 @@ import dataclasses
 import json
 import math
 import numbers
+import reprlib
 import types
 import typing
 from typing import Any
 
 
 class InputError(Exception):
-    """Something that a person gave is wrong. The command line prints it as one sentence and exits with code 2."""
+    """Something that a person gave is wrong. The command line prints it as one sentence and exits with `exit_code`."""
+
+    exit_code = 2
+
+
+class RunError(InputError):
+    """A run failed while it ran: its environment raised or returned a value that is not finite, or the training diverged.
+
+    `__cause__` is what the environment raised.
+    """
+
+    exit_code = 1
+
+
+def brief(value: Any) -> str:
+    """A value in a few words: an array by its shape and dtype, plain values shortened, others by their class."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and not isinstance(value, numbers.Number):
+        return f"an array of shape {shape} and dtype {getattr(value, 'dtype', 'unknown')}"
+    if value is None or isinstance(value, (str, bytes, numbers.Number, list, tuple, dict, set)):
+        text = reprlib.repr(value)
+        return text if len(text) <= 80 else f"{text[:77]}..."
+    return f"an object of class {type(value).__module__}.{type(value).__qualname__}"
 
 
 def shown(text: str, longest: int = 1500) -> str:
@@ -37,7 +60,7 @@ def check_kinds(settings: Any) -> None:
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if not _fits(value, hint):
-            raise InputError(f"{type(settings).__name__}.{field.name} is {value!r}; it must be {_described(hint)}.")
+            raise InputError(f"{type(settings).__name__}.{field.name} is {brief(value)}; it must be {_described(hint)}.")
 
 
 def json_object(name: str, value: Any) -> dict[str, Any]:
@@ -56,7 +79,7 @@ def json_object(name: str, value: Any) -> dict[str, Any]:
 def _fits(value: Any, hint: Any) -> bool:
     """Whether a value is of a kind; of an annotation that says more than is known here, every value is."""
     if typing.get_origin(hint) is typing.Literal:
-        return value in typing.get_args(hint)
+        return isinstance(value, str) and value in typing.get_args(hint)
     if isinstance(hint, types.UnionType):
         return any(_fits(value, part) for part in typing.get_args(hint))
     if hint in (int, float):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,7 @@ import gymnasium
 import numpy as np
 
 from pcil import envs
+from pcil.errors import InputError
 from pcil.seeds import Stream, episode_seed
 
 LOCKSTEP = 32
@@ -34,9 +36,28 @@ class Evaluation:
         return float(np.mean(self.returns))
 
 
-def environments_for(task: str, episodes: int, env_kwargs: dict[str, Any] | None = None) -> list[gymnasium.Env]:
-    """What `evaluate` plays so many episodes in: one each, but not more than `LOCKSTEP`, for each takes memory."""
-    return [envs.make(task, env_kwargs=env_kwargs) for _ in range(min(episodes, LOCKSTEP))]
+@contextlib.contextmanager
+def environments_for(
+    task: Any,
+    episodes: int,
+    env_kwargs: dict[str, Any] | None = None,
+    *,
+    training: bool = False,
+    single: bool = False,
+) -> Iterator[list[envs.Checked]]:
+    """What `evaluate` plays so many episodes in, closed at the end: one each, but at most `LOCKSTEP`, for each takes memory.
+
+    With `training` there is a further one for training, the first; where it must be `single`, there is one for everything.
+    """
+    with contextlib.ExitStack() as stack:
+        number = 1 if single else min(episodes, LOCKSTEP) + training
+        made = [stack.enter_context(envs.opened(task, env_kwargs=env_kwargs)) for _ in range(number)]
+        if len({id(env.unwrapped) for env in made}) < number:
+            raise InputError(
+                f"The {envs.task_name(task)} returned the same environment twice; let it make a new one each time, or set "
+                "single_environment."
+            )
+        yield made
 
 
 def evaluate(
@@ -48,23 +69,31 @@ def evaluate(
 ) -> Evaluation:
     """So many episodes, by default one in each of `environments`, as many at once as there are of these.
 
-    `act` maps observations `[k, obs]` of those still running to `[k, action]`.
+    `act` maps observations `[k, obs]` of a block of episodes to `[k, action]`; rows of episodes that are over, or are not being
+    played yet, mean nothing. A matrix product of other shape may differ in the last bit, so the block is the same whether its
+    episodes are played all at once or one by one.
 
     Episode `i` starts from a seed that depends on `seed` and `i` alone, so every evaluation of a run meets the same starts.
     """
     begin = time.perf_counter()
-    episodes = len(environments) if episodes is None else episodes
+    checked = [envs.checked(env) for env in environments]
+    episodes = len(checked) if episodes is None else episodes
     returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
-    for first in range(0, episodes, len(environments)):
-        block = dict(zip(range(first, episodes), environments, strict=False))
-        seeds = {i: episode_seed(seed, Stream.EVALUATE, i) for i in block}
-        obs = {i: np.array(env.reset(seed=seeds[i])[0], np.float32) for i, env in block.items()}
-        while obs:
-            for i, action in zip(list(obs), act(np.stack([*obs.values()])), strict=True):
-                new, reward, terminated, truncated, _ = block[i].step(action)
-                returns[i] += float(reward)
-                lengths[i] += 1
-                obs[i] = np.array(new, np.float32)
-                if terminated or truncated:
-                    del obs[i]
+    size = max(LOCKSTEP, len(checked))
+    for first in range(0, episodes, size):
+        block = range(first, min(first + size, episodes))
+        for start in range(first, block.stop, len(checked)):
+            playing = dict(zip(range(start, block.stop), checked, strict=False))
+            rows = np.zeros((len(block), envs.spec(checked[0]).obs_dim), np.float32)
+            for i, env in playing.items():
+                env.episode, start_seed = f"evaluation episode {i + 1}", episode_seed(seed, Stream.EVALUATE, i)
+                rows[i - first] = env.reset(seed=start_seed)[0]
+            while playing:
+                for i, action in zip(block, act(rows), strict=True):
+                    if i in playing:
+                        rows[i - first], reward, terminated, truncated, _ = playing[i].step(action)
+                        returns[i] += reward
+                        lengths[i] += 1
+                        if terminated or truncated:
+                            del playing[i]
     return Evaluation(returns, lengths, time.perf_counter() - begin)

@@ -33,17 +33,16 @@ def film(folder: Path, steps: int = 160, every: int = 4) -> bytes:
     from PIL import Image
 
     policy = load_policy(folder)
-    env = envs.make(policy.task, render_mode="rgb_array", env_kwargs=policy.env_kwargs)
-    obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
-    frames, over = [], False
-    while not over and len(frames) * every < steps:
-        frames.append(Image.fromarray(np.asarray(env.render())))
-        for _ in range(every):
-            if not over:
-                obs, _, terminated, truncated, _ = env.step(policy(obs))
-                over = terminated or truncated
-    milliseconds = round(1000 * every / env.unwrapped.metadata.get("render_fps", 30))
-    env.close()
+    with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=policy.env_kwargs) as env:
+        obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
+        frames, over = [], False
+        while not over and len(frames) * every < steps:
+            frames.append(Image.fromarray(np.asarray(env.render())))
+            for _ in range(every):
+                if not over:
+                    obs, _, terminated, truncated, _ = env.step(policy(obs))
+                    over = terminated or truncated
+        milliseconds = round(1000 * every / env.unwrapped.metadata.get("render_fps", 30))
     file = io.BytesIO()
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, quality=50)
     return file.getvalue()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -19,6 +19,8 @@ from pcil.rewards import Reward, label, states_read
 from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec, Window
 
+UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch"}
+"""What an update checks besides its metrics, and how errors call it."""
 LABEL_ROWS = 256
 """Episodes are labelled in multiples of so many rows."""
 
@@ -31,7 +33,8 @@ class Learner(eqx.Module):
     root: PRNGKeyArray
     """Key data; every key is folded from it and a counter."""
     totals: dict[str, Array]
-    """Sums of the metrics since they were last read, and under "updates" how many."""
+    """Sums of the metrics since they were last read; under "updates" how many, and under "finite" `[checks]` how many before
+    each of `checks(totals)` was first not finite."""
 
 
 @functools.partial(jax.jit, static_argnames=("method", "spec"))
@@ -47,7 +50,8 @@ def init(method: Method, spec: Spec, demos: Sequence[Batch], seed: int | Array) 
     window = _zeros(spec, method.agent.batch_size, max(method.agent.n_step, method.reward.span))
     expert = _zeros(spec, method.reward.batch_size, method.reward.span)
     metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
-    return eqx.tree_at(lambda s: s.totals, learner, {name: jnp.zeros(()) for name in [*sorted(metrics), "updates"]})
+    zeros = {name: jnp.zeros(()) for name in [*sorted(metrics.keys() - set(UNSAID)), "updates"]}
+    return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(metrics))})
 
 
 def _zeros(spec: Spec, rows: int, n: int) -> Window:
@@ -73,7 +77,10 @@ def update(
     drawn. The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
     learner, metrics = _step(method, learner, window, expert, seen, step, count)
-    totals = {name: learner.totals[name] + value for name, value in {**metrics, "updates": 1.0}.items()}
+    before = learner.totals
+    good = jnp.stack([jnp.isfinite(metrics[name]) for name in checks(metrics)])
+    totals = {name: before[name] + value for name, value in {**metrics, "updates": 1.0}.items() if name not in UNSAID}
+    totals["finite"] = before["finite"] + jnp.where(good & (before["finite"] == before["updates"]), 1.0, 0.0)
     learner = eqx.tree_at(lambda s: s.totals, learner, totals)
     return learner, jax.tree.map(jnp.copy, method.agent.actor(learner.agent))
 
@@ -97,10 +104,50 @@ def _step(
     if method.label == "sampled":
         fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
+    unsaid = {"features": embed, "rewards": window.reward}
     agent_state, agent_metrics = method.agent.update(agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
+    metrics |= {name: _largest(tree) for name, tree in unsaid.items()}
     return Learner(agent_state, reward_state, learner.root, learner.totals), metrics
+
+
+def _largest(tree: Any) -> Float[Array, ""]:
+    """The largest absolute value; not finite where any is not."""
+    return functools.reduce(jnp.maximum, (jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)))
+
+
+def checks(names: Iterable[str]) -> list[str]:
+    """What is checked in each update, in the order in which an update computes it; `names` are those of metrics or totals."""
+    own = sorted(set(names) - {"updates", "finite", *UNSAID})
+    parts = [[name for name in own if name.startswith(part)] for part in ("reward/", "agent/")]
+    return ["features", *parts[0], "rewards", *parts[1]]
+
+
+def first_not_finite(learner: Learner) -> tuple[str, int] | None:
+    """What left the finite range first, and after how many finite updates since the totals were last set to 0; None if all is
+    finite. Several losses of one update are named together, and parameters where every loss was still finite."""
+    totals = jax.device_get(learner.totals)
+    names, counts, updates = checks(totals), totals["finite"].tolist(), int(totals["updates"])
+    if (first := int(min(counts))) < updates:
+        bad = [name for name, count in zip(names, counts, strict=True) if count == first]
+        bad = [name for name in bad if name.partition("/")[0] == bad[0].partition("/")[0]]
+        return " and ".join(UNSAID.get(name, name) for name in bad), first - (bad[0] == "features")
+    arrays = eqx.filter({"agent": learner.agent, "reward": learner.reward}, eqx.is_inexact_array)
+    for path, good in jax.tree_util.tree_flatten_with_path(_are_finite(arrays))[0]:
+        if not good:
+            return f"the parameters {jax.tree_util.keystr(path, simple=True, separator='.')}", updates - 1
+    return None
+
+
+@jax.jit
+def _are_finite(arrays: Any) -> Any:
+    return jax.tree.map(lambda array: jnp.isfinite(array).all(), arrays)
+
+
+def on_host(actor: Actor) -> Actor:
+    """The actor's arrays in NumPy; waits until the update that makes them has finished."""
+    return jax.tree.map(np.asarray, actor)
 
 
 def close_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Learner:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pcil import checkpoint, envs, learner, seeds
 from pcil.config import Run
-from pcil.errors import InputError
+from pcil.errors import InputError, RunError
 from pcil.evaluate import Evaluation, environments_for, evaluate
-from pcil.learner import Learner
-from pcil.metrics import MetricWriter, pearson
+from pcil.learner import Learner, on_host
+from pcil.metrics import Clock, MetricWriter, described
 from pcil.networks import Actor
 from pcil.policy import Policy
 from pcil.replay import Replay
@@ -74,58 +73,87 @@ class Stopped(Exception):
     """The run was asked to stop, and has saved itself."""
 
 
-def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Reporter) -> State:
+def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Reporter, task: Any = None) -> State:
     """Train until `run.frames`, resuming from the folder's newest whole checkpoint; each pass of the loop is one episode.
 
-    An offline agent has passes of `OFFLINE_STEPS` updates instead. `demos` may be empty where nothing needs them. Returns the
-    final state, with the final return in its counters. Raises `Stopped` where the reporter asks for it.
+    An offline agent has passes of `OFFLINE_STEPS` updates instead. `demos` may be empty where nothing needs them. `task` makes
+    the environments, by default `run.task`. Returns the final state, with the final return in its counters. Raises `Stopped`
+    where the reporter asks for it, and `InputError` or `RunError` after it has saved the state of before the present pass.
     """
-    env = envs.make(run.task, env_kwargs=run.env_kwargs)
-    spec = envs.spec(env)
-    rollout = environments_for(run.task, run.evaluate_episodes, run.env_kwargs)
-    state, positions = resume(run, folder, start(run, spec, demos), reporter)
-    clock = _Clock(state.counters.seconds)
-    saved = clock.total()
-
-    with MetricWriter(folder, positions, state.counters.frames) as log:
+    with contextlib.ExitStack() as stack:
+        task, single = run.task if task is None else task, run.single_environment
+        copies = environments_for(task, run.evaluate_episodes, run.env_kwargs, training=True, single=single)
+        env, *rollout = stack.enter_context(copies)
+        rollout, spec = rollout or [env], envs.spec(env)
+        state, positions = resume(run, folder, start(run, spec, demos), reporter)
+        clock = Clock(state.counters.seconds)
+        saved = clock.total()
+        log = stack.enter_context(MetricWriter(folder, positions, state.counters.frames))
         while state.counters.frames < run.frames:
-            if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
-                _evaluate(run, folder, state, rollout, log, clock, reporter)
+            with _saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
+                if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
+                    _evaluate(run, folder, state, rollout, log, clock, reporter)
+                episode = _study(run, spec, state) if run.agent.offline else play(run, env, spec, state)
+                refuse_divergence()
+                if episode:
+                    kept, learned = _labelled(run, state, episode)
 
-            if run.agent.offline:
-                _study(run, spec, state)
-                _log_pass(state, {}, log, clock)
-            else:
-                episode = play(run, env, spec, state)
-                kept = absorbed(run, episode)
-                state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
-                learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
+            if episode:
                 state.replay.add(kept, learned if run.label == "stored" else kept.reward)
                 _refuse_short_episodes(run, state)
-                _log_pass(state, _described(episode, learned), log, clock)
+                _log_pass(state, described(episode, learned), log, clock)
                 reporter.episode(run, state.counters.frames, episode.total_reward)
+            else:
+                _log_pass(state, {}, log, clock)
 
             stop = reporter.stop()
             if stop or clock.total() - saved >= run.checkpoint_seconds:
-                _save(folder, state, log, clock)
+                _save(folder, state, log.positions(), clock)
                 saved = clock.total()
             if stop:
                 raise Stopped
 
         if state.counters.final_return is None:
-            result = _evaluate(run, folder, state, rollout, log, clock, reporter)
+            with _saved_on_failure(run, folder, state, log, clock):
+                result = _evaluate(run, folder, state, rollout, log, clock, reporter)
             state.counters = replace(state.counters, final_return=result.mean)
-            _save(folder, state, log, clock)
+            _save(folder, state, log.positions(), clock)
     return state
 
 
-def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
+@contextlib.contextmanager
+def _saved_on_failure(run: Run, folder: Path, state: State, log: MetricWriter, clock: Clock) -> Iterator[Callable[[], None]]:
+    """Where the environment fails or training diverges, a checkpoint of the state as it is now is left, and no later one.
+
+    What it gives raises `RunError` where an update since has left the finite range.
+    """
+    before, positions = replace(state, learner=jax.tree.map(jnp.copy, state.learner)), log.positions()
+
+    def refuse_divergence() -> None:
+        if found := learner.first_not_finite(state.learner):
+            what, updates = found
+            raise RunError(
+                f"The training on {run.task} diverged: {what} became NaN or infinite in update "
+                f"{before.counters.updates + updates + 1:,}, after frame {before.counters.frames:,}; what was learned "
+                "before is kept, and a smaller learning rate may help."
+            )
+
+    try:
+        yield refuse_divergence
+    except InputError:
+        _save(folder, before, positions, clock)
+        refuse_divergence()  # it came first, where the actor's actions are not finite any more
+        raise
+
+
+def play(run: Run, env: envs.Checked, spec: Spec, state: State) -> Episode:
     """One episode: act, update (the device works while the environment steps), step."""
     counters = state.counters
     act_rng = seeds.rng(run.seed, Stream.ACT, counters.episodes)
     sample_rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
     seed = seeds.episode_seed(run.seed, Stream.EPISODE, counters.episodes)
-    observations, actions, rewards = [np.array(env.reset(seed=seed)[0], np.float32)], [], []
+    env.episode = f"training episode {counters.episodes + 1}"
+    observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
     explore = run.agent.explorer(spec.action_dim, act_rng)
     host: Actor | None = None
     over = terminated = False
@@ -139,7 +167,7 @@ def play(run: Run, env: gymnasium.Env, spec: Spec, state: State) -> Episode:
             counters, host = _update(run, state, state.replay, counters, sample_rng), None
         obs, reward, terminated, truncated, _ = env.step(action)
         over = terminated or truncated
-        observations.append(np.array(obs, np.float32))  # a copy: the environment may reuse its buffer
+        observations.append(obs)
         actions.append(action)
         rewards.append(reward)
         counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
@@ -169,6 +197,18 @@ def _refuse_short_episodes(run: Run, state: State) -> None:
         )
 
 
+def _labelled(run: Run, state: State, episode: Episode) -> tuple[Episode, np.ndarray]:
+    """The episode as the replay keeps it, and the learned reward of each of its steps."""
+    kept = absorbed(run, episode)
+    state.learner = learner.close_episode(run.learner, state.learner, kept, state.counters.episodes)
+    learned = learner.label_episode(run.learner, state.learner, kept, state.counters.episodes)
+    if not np.isfinite(learned).all():
+        step = int(np.argmin(np.isfinite(learned)))
+        where = f"step {step + 1} of training episode {state.counters.episodes} of {run.task}"
+        raise RunError(f"The learned reward is {learned[step]} in {where}.")
+    return kept, learned
+
+
 def _study(run: Run, spec: Spec, state: State) -> None:
     """Updates on the demonstrations alone; each counts as the agent step that it takes the place of."""
     assert state.expert is not None
@@ -192,30 +232,15 @@ def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.
     return replace(counters, updates=counters.updates + 1)
 
 
-def on_host(actor: Actor) -> Actor:
-    """The actor's arrays in NumPy; waits until the update that makes them has finished."""
-    return jax.tree.map(np.asarray, actor)
-
-
-def _described(episode: Episode, learned: np.ndarray) -> dict[str, Any]:
-    """What an episode brought, what the learned reward made of it, and how the two correlate: the method's health."""
-    return {
-        "return": episode.total_reward,
-        "length": len(episode),
-        "learned_return": float(learned.sum(dtype=np.float64)),
-        "correlation": pearson(learned[: len(episode)], episode.reward),
-    }
-
-
-def _log_pass(state: State, values: dict[str, Any], log: MetricWriter, clock: _Clock) -> None:
+def _log_pass(state: State, values: dict[str, Any], log: MetricWriter, clock: Clock) -> None:
     """One line for the episode, with the mean of each update's metrics."""
-    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items()}
+    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items() if name != "finite"}
     updates = totals.pop("updates")
     values = {"episode": state.counters.episodes, **values, "updates": state.counters.updates}
     values |= {name: total / updates for name, total in totals.items() if updates}
     values |= {"seconds": round(clock.total(), 2), "frames_per_second": round(clock.rate(state.counters.frames), 1)}
     log.episode(state.counters.frames, values)
-    zeros = {name: jnp.zeros(()) for name in state.learner.totals}
+    zeros = jax.tree.map(jnp.zeros_like, state.learner.totals)
     state.learner = Learner(state.learner.agent, state.learner.reward, state.learner.root, zeros)
 
 
@@ -223,9 +248,9 @@ def _evaluate(
     run: Run,
     folder: Path,
     state: State,
-    rollout: list[gymnasium.Env],
+    rollout: list[envs.Checked],
     log: MetricWriter,
-    clock: _Clock,
+    clock: Clock,
     reporter: Reporter,
 ) -> Evaluation:
     """Roll out the mean action, write `eval.csv`, and leave the policy of this moment in the folder."""
@@ -270,14 +295,14 @@ def absorbed(run: Run, episode: Episode) -> Episode:
     return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
 
 
-def _save(folder: Path, state: State, log: MetricWriter, clock: _Clock) -> None:
+def _save(folder: Path, state: State, positions: dict[str, int], clock: Clock) -> None:
     """Everything that the rest of the run depends on; a finished run needs no replay, and an offline agent's is empty."""
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
     arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
     if counters.final_return is None and state.replay.num_episodes:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
-    meta = {"counters": asdict(counters), "positions": log.positions()}
+    meta = {"counters": asdict(counters), "positions": positions}
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
 
 
@@ -290,9 +315,11 @@ def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[St
         if (folder / "train.jsonl").exists():
             reporter.say(f"There is no whole checkpoint in {folder}, so the run begins again.")
         return fresh, {}
+    arrays = checkpoint.flatten("learner.totals", fresh.learner.totals) | arrays  # all are 0, and older versions have fewer
     try:
         restored = checkpoint.unflatten("learner", fresh.learner, arrays)
-        actor = checkpoint.unflatten("actor", fresh.actor, arrays)
+        known = checkpoint.flatten("actor", fresh.actor).keys() <= arrays.keys()  # older ones have no scale of observations
+        actor = checkpoint.unflatten("actor", fresh.actor, arrays) if known else run.agent.actor(restored.agent)
         counters = Counters(**meta["counters"])
     except (ValueError, TypeError) as error:
         raise InputError(
@@ -303,21 +330,3 @@ def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[St
             fresh.replay.load(held)
         reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
     return State(restored, actor, fresh.replay, fresh.expert, counters), meta["positions"]
-
-
-class _Clock:
-    """Wall-clock seconds, going on from where an earlier session stopped."""
-
-    def __init__(self, before: float) -> None:
-        self._before, self._begin = before, time.perf_counter()
-        self._last: tuple[int, float] | None = None
-
-    def total(self) -> float:
-        """Seconds over all sessions."""
-        return self._before + time.perf_counter() - self._begin
-
-    def rate(self, frames: int) -> float:
-        """Frames a second since the last call."""
-        now = self.total()
-        before, self._last = self._last, (frames, now)
-        return (frames - before[0]) / max(now - before[1], 1e-9) if before else 0.0

@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pcil.evaluate import Evaluation
+from pcil.types import Episode
 
 EVAL_COLUMNS = ("frames", "episode", "return", "length", "seconds")
 WALL_CLOCK = ("seconds", "frames_per_second")
@@ -73,8 +76,38 @@ class MetricWriter:
         self._files[name].flush()
 
 
+def described(episode: Episode, learned: np.ndarray) -> dict[str, Any]:
+    """What an episode brought, what the learned reward made of it, and how the two correlate: the method's health."""
+    return {
+        "return": episode.total_reward,
+        "length": len(episode),
+        "learned_return": float(learned.sum(dtype=np.float64)),
+        "correlation": pearson(learned[: len(episode)], episode.reward),
+    }
+
+
 def pearson(x: np.ndarray, y: np.ndarray) -> float | None:
     """Pearson correlation; None where one of the two does not vary."""
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
-    return float(np.corrcoef(x.astype(np.float64), y.astype(np.float64))[0, 1])
+    with np.errstate(invalid="ignore"):  # of values so small that their squares are 0
+        value = float(np.corrcoef(x.astype(np.float64), y.astype(np.float64))[0, 1])
+    return value if math.isfinite(value) else None
+
+
+class Clock:
+    """Wall-clock seconds, going on from where an earlier session stopped."""
+
+    def __init__(self, before: float) -> None:
+        self._before, self._begin = before, time.perf_counter()
+        self._last: tuple[int, float] | None = None
+
+    def total(self) -> float:
+        """Seconds over all sessions."""
+        return self._before + time.perf_counter() - self._begin
+
+    def rate(self, frames: int) -> float:
+        """Frames a second since the last call."""
+        now = self.total()
+        before, self._last = self._last, (frames, now)
+        return (frames - before[0]) / max(now - before[1], 1e-9) if before else 0.0

@@ -146,11 +146,12 @@ def _unit_actions(stored: Any, space: dict[str, Any]) -> Float[np.ndarray, "T ac
 
 
 def _flat(values: Any, space: dict[str, Any]) -> Float[np.ndarray, "T dim"]:
-    """The values of `space` as rows of numbers, the parts of a Dict in the order that the environment gave them."""
-    if space["type"] == "Dict":
-        return np.concatenate([_flat(values[key], part) for key, part in space["subspaces"].items()], axis=1)
+    """The values of `space` as rows of numbers, the parts of Dicts and Tuples in the order that the environment gave them."""
+    if space["type"] in ("Dict", "Tuple"):
+        parts = space["subspaces"].items() if space["type"] == "Dict" else enumerate(space["subspaces"])
+        return np.concatenate([_flat(values[key], part) for key, part in parts], axis=1)
     if space["type"] != "Box":
-        raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box")
+        raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box or Tuple, nested ones too")
     if values.dtype.kind not in "fiub" or list(values.shape[1:]) != space["shape"]:
         raise ValueError(f"{values.dtype} {values.shape[1:]} is stored where there must be numbers {space['shape']}")
     return values.reshape(len(values), math.prod(space["shape"])).astype(np.float64)

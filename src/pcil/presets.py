@@ -12,7 +12,7 @@ from typing import Any
 
 from pcil.agents import BC, DrQV2
 from pcil.config import Run, changed
-from pcil.errors import InputError
+from pcil.errors import InputError, brief
 from pcil.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN, TaskReward
 
@@ -170,7 +170,7 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str
 METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 
 
-def make(task: str, method: str = "pcil", preset: str = "default", **changes: Any) -> Run:
+def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: Any) -> Run:
     """The run of a method with a preset, and any of its settings changed: `seed=2`, `**{"agent.gamma": 0.98}`.
 
     Unknown names raise `InputError`.
@@ -187,6 +187,6 @@ def make(task: str, method: str = "pcil", preset: str = "default", **changes: An
     return changed(run, nested | changes)
 
 
-def _known(kind: str, name: str, names: Any) -> None:
-    if name not in names:
-        raise InputError(f"There is no {kind} {name!r}; the {kind}s are {', '.join(names)}.")
+def _known(kind: str, name: Any, names: Any) -> None:
+    if not isinstance(name, str) or name not in names:
+        raise InputError(f"There is no {kind} {brief(name)}; the {kind}s are {', '.join(names)}.")

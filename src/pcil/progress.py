@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
@@ -58,18 +59,23 @@ class Screen(Console):
 class Signals:
     """While it is entered, the first Ctrl-C, SIGTERM or SIGHUP is kept and answered; a second Ctrl-C stops at once.
 
-    A SIGHUP that is ignored, as under nohup, stays ignored.
+    A SIGHUP that is ignored, as under nohup, stays ignored. Of other threads than the main one Python takes no handlers, so
+    there all stays as it is.
     """
 
-    def __init__(self, answer: Callable[[], None]) -> None:
+    def __init__(self, answer: Callable[[], None], *numbers: int) -> None:
+        """`numbers` are the signals, by default these three."""
         self.number: int | None = None
-        self._answer = answer
+        self._answer, self._numbers = answer, set(numbers)
 
     def __enter__(self) -> Signals:
-        numbers = {signal.SIGINT, signal.SIGTERM}
         hangup = getattr(signal, "SIGHUP", None)  # Windows has none
-        if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:
-            numbers.add(hangup)
+        ours = {signal.SIGINT, signal.SIGTERM} | ({hangup} if hangup is not None else set())
+        numbers = self._numbers or ours
+        if threading.current_thread() is not threading.main_thread():
+            numbers = set()
+        elif hangup is not None and signal.getsignal(hangup) == signal.SIG_IGN:
+            numbers = numbers - {hangup}
         self._before = {number: signal.signal(number, self._ask) for number in numbers}
         return self
 

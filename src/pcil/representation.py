@@ -50,14 +50,15 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     run = restored(source.settings)
     if type(run.reward).representation is Reward.representation:
         return []
-    demos, env = runs.demonstrations(run), envs.make(run.task, env_kwargs=run.env_kwargs)
+    demos = runs.demonstrations(run)
     assert demos is not None
-    state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
-    if not state.counters.episodes:
-        raise InputError(f"{source.folder} holds no checkpoint that can be read.")
-    rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
-    frames = state.counters.frames
-    episode = loop.play(dataclasses.replace(run, update_every=_NEVER), env, envs.spec(env), state)
+    with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:
+        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
+        if not state.counters.episodes:
+            raise InputError(f"{source.folder} holds no checkpoint that can be read.")
+        rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
+        frames = state.counters.frames
+        episode = loop.play(dataclasses.replace(run, update_every=_NEVER), env, envs.spec(env), state)
     embed = learner.frozen_embed(run.learner, state.learner.agent)
     seen = []
     for episodes, rows in ((demos.episodes, EXPERT_STEPS), ([episode], AGENT_STEPS)):

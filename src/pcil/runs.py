@@ -7,17 +7,21 @@ import errno
 import json
 import os
 import platform
+import signal
 import subprocess
+import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from pcil import compilation, envs, files, fit, loop, presets
+import gymnasium
+
+from pcil import compilation, envs, files, fit, loop, presets, progress
 from pcil.config import Run, changed, completed, differences
 from pcil.demos import Demonstrations
-from pcil.errors import InputError
+from pcil.errors import InputError, RunError, brief
 from pcil.evaluate import Evaluation
 from pcil.policy import Policy, load_policy
 
@@ -57,35 +61,94 @@ class Silent:
 
 
 def train(
-    task: str,
+    task: Any,
     *,
-    out: str | Path,
-    method: str = "pcil",
-    preset: str = "default",
+    out: Any,
+    method: Any = "pcil",
+    preset: Any = "default",
+    demos: Any = None,
     reporter: loop.Reporter | None = None,
     **changes: Any,
 ) -> Result:
     """Train a policy in the folder `out`, or resume or report what is there.
 
-    `changes` are fields of `Run` (`seed=1`, `frames=200_000`, `demos=...`). Raises `InputError` where something given is
-    wrong, and `loop.Stopped` where the reporter asks to stop.
+    `task` is a task's name, a function that makes a new environment at each call, or an environment, which is then the run's
+    single one and is not closed. `demos` are `Demonstrations`, or the name or path of some. `changes` are fields of `Run`
+    (`seed=1`, `frames=200_000`).
+
+    Raises `InputError` where something given is wrong, `RunError` where the environment fails or training diverges, and
+    `loop.Stopped` where the reporter asks to stop. The first Ctrl-C ends the run after the episode at hand and saves it before
+    `KeyboardInterrupt` is raised; a second one raises it at once.
     """
-    changes = {name: value for name, value in changes.items() if value is not None}
-    return execute(presets.make(envs.task_name(task), method, preset, **changes), Path(out), reporter or Silent())
+    if not isinstance(out, (str, os.PathLike)):
+        raise InputError(f"out is {brief(out)}; it must be the path of a folder.")
+    if demos is not None and not isinstance(demos, (str, os.PathLike, Demonstrations)):
+        raise InputError(
+            f"demos is {brief(demos)}; it must be a shipped task, the path or id of a Minari dataset, or pcil.Demonstrations."
+        )
+    given = demos if isinstance(demos, Demonstrations) else None
+    named = brief(demos) if isinstance(demos, Demonstrations) else demos and os.fspath(demos)
+    changes = {name: value for name, value in {**changes, "demos": named}.items() if value is not None}
+    if isinstance(task, gymnasium.Env):
+        changes["single_environment"] = True
+    run = presets.make(envs.task_name(task), method, preset, **changes)
+    with progress.Signals(lambda: None, signal.SIGINT) as signals:
+        listener = _Interruptible(reporter or Silent(), signals)
+        try:
+            result = execute(run, Path(out), listener, task=task, demos=given)
+        except loop.Stopped:
+            if signals.number is None:
+                raise
+            raise KeyboardInterrupt from None
+    if signals.number is not None:
+        raise KeyboardInterrupt
+    return result
 
 
-def execute(run: Run, folder: Path, reporter: loop.Reporter) -> Result:
-    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference."""
+class _Interruptible:
+    """A reporter that also asks to stop where a signal did."""
+
+    def __init__(self, reporter: loop.Reporter, signals: progress.Signals) -> None:
+        self.episode, self.evaluation, self.say = reporter.episode, reporter.evaluation, reporter.say
+        self._stop, self._signals = reporter.stop, signals
+
+    def stop(self) -> bool:
+        return self._stop() or self._signals.number is not None
+
+
+def execute(
+    run: Run, folder: Path, reporter: loop.Reporter, *, task: Any = None, demos: Demonstrations | None = None
+) -> Result:
+    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference.
+
+    `task` and `demos` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
+    """
     compilation.use_cache()
-    folder, demos = files.expanded(folder), demonstrations(run, reporter.say)
-    run, why = with_absorbing_decided(run, demos)
+    folder, demos = files.expanded(folder), demonstrations(run, reporter.say, task=task, given=demos)
+    run, why = with_absorbing_decided(run, demos, task)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
             reporter.say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
-            final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter).counters.final_return
+            (folder / "error.txt").unlink(missing_ok=True)
+            with _traceback_kept(folder / "error.txt"):
+                final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter, task).counters.final_return
             _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
+
+
+@contextlib.contextmanager
+def _traceback_kept(path: Path) -> Iterator[None]:
+    """Where an environment raises, its traceback goes to a file that the error names."""
+    try:
+        yield
+    except RunError as error:
+        if error.__cause__ is None:
+            raise
+        path.write_text("".join(traceback.format_exception(error.__cause__)))
+        raise RunError(
+            f"{str(error).removesuffix('.')}; its traceback is in {path}, and the same command goes on from the episode before."
+        ) from error.__cause__
 
 
 def read_done(folder: Path) -> float:
@@ -98,10 +161,20 @@ def read_done(folder: Path) -> float:
         ) from error
 
 
-def demonstrations(run: Run, say: Callable[[str], None] = lambda text: None) -> Demonstrations | None:
-    """What the run imitates, checked against its environment, or None where it needs no demonstrations; `say` is told what a
-    person should know of them."""
-    environment = envs.make(run.task, env_kwargs=run.env_kwargs)
+def demonstrations(
+    run: Run, say: Callable[[str], None] = lambda text: None, *, task: Any = None, given: Demonstrations | None = None
+) -> Demonstrations | None:
+    """What the run imitates, checked against its environment, or None where it needs no demonstrations.
+
+    `task` and `given` stand in for what `run.task` and `run.demos` name; `say` is told what a person should know of them.
+    """
+    with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as environment:
+        return _fitted(run, environment, say, given)
+
+
+def _fitted(
+    run: Run, environment: envs.Checked, say: Callable[[str], None], given: Demonstrations | None
+) -> Demonstrations | None:
     limit = environment.spec and environment.spec.max_episode_steps
     if limit and limit >= run.replay_steps:
         raise InputError(
@@ -110,7 +183,8 @@ def demonstrations(run: Run, say: Callable[[str], None] = lambda text: None) -> 
     if not run.reward.needs_demos and not run.agent.offline:
         return None
     source = run.task if run.demos is None else run.demos
-    demos = fit.fitted(run, Demonstrations.load(source, bounded=False).take(run.num_demos), environment, say)
+    loaded = given or Demonstrations.load(source, bounded=False)
+    demos = fit.fitted(run, loaded.take(run.num_demos), environment, say)
     steps = max(run.reward.span if run.reward.batch_size else 1, run.agent.n_step if run.agent.offline else 1)
     if all(len(episode) < steps and not episode.terminated for episode in demos.episodes):
         raise InputError(
@@ -119,8 +193,8 @@ def demonstrations(run: Run, say: Callable[[str], None] = lambda text: None) -> 
     return demos
 
 
-def with_absorbing_decided(run: Run, demos: Demonstrations | None) -> tuple[Run, str]:
-    """The run with `agent.absorbing` decided, and the reason in words.
+def with_absorbing_decided(run: Run, demos: Demonstrations | None, task: Any = None) -> tuple[Run, str]:
+    """The run with `agent.absorbing` decided, and the reason in words; `task` stands in for what `run.task` names.
 
     Without the absorbing state an early end is worth 0 to the agent: where learned rewards are positive it avoids a goal that
     ends the episode, and where they are negative it gives up early (Kostrikov et al. 2019, section 4.2).
@@ -132,10 +206,10 @@ def with_absorbing_decided(run: Run, demos: Demonstrations | None) -> tuple[Run,
         absorbing, why = False, "no reward is learned"
     elif demos and ended:
         absorbing, why = True, f"{ended} of {len(demos.episodes)} demonstrations end early"
-    elif envs.ends_early(envs.make(run.task, env_kwargs=run.env_kwargs)):
-        absorbing, why = True, f"an episode of {run.task} may end early"
     else:
-        absorbing, why = False, f"no episode of {run.task} ends early"
+        with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as env:
+            absorbing = envs.ends_early(env)
+        why = f"an episode of {run.task} may end early" if absorbing else f"no episode of {run.task} ends early"
     return changed(run, {"agent.absorbing": absorbing}), why
 
 

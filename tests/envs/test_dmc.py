@@ -185,7 +185,7 @@ def test_an_episode_is_a_function_of_its_seed() -> None:
 
 @pytest.mark.parametrize("bad", [1.0000001, -1.5, np.nan, np.inf])
 def test_actions_out_of_range_are_refused(bad: float) -> None:
-    env = make("walker_walk")
+    env = make("walker_walk").unwrapped
     env.reset(seed=0)
     action = np.zeros(6, np.float32)
     action[4] = bad
@@ -224,7 +224,7 @@ def test_a_task_with_its_own_step_is_left_to_itself() -> None:
 
 
 def test_a_diverged_simulation_raises_dm_controls_error() -> None:
-    env, reference = make("walker_walk"), Reference("walker_walk", 0)
+    env, reference = make("walker_walk").unwrapped, Reference("walker_walk", 0)
     env.reset(seed=0)
     reference.reset()
     for physics in (env.unwrapped.physics, reference.physics):

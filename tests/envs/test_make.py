@@ -67,14 +67,14 @@ def register_env() -> Iterator[Any]:
 
 
 def test_public_names() -> None:
-    assert set(envs.__all__) == {"TASKS", "make", "register", "spec", "task_name"}
+    assert set(envs.__all__) == {"TASKS", "Checked", "checked", "make", "opened", "register", "spec", "task_name"}
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_ten_have_their_sizes_and_no_wrapper(task: str) -> None:
     env = make(task)
     assert spec(env) == SPECS[task]
-    assert env is env.unwrapped
+    assert type(env) is envs.Checked and env.env is env.unwrapped, "nothing but the checks is around it"
     assert env.spec.id == f"dmc/{task}-v0"
     assert env.observation_space.dtype == env.action_space.dtype == np.float32
     assert np.all(env.action_space.low == -1.0) and np.all(env.action_space.high == 1.0)
@@ -82,7 +82,7 @@ def test_the_ten_have_their_sizes_and_no_wrapper(task: str) -> None:
 
 def test_a_task_has_one_name() -> None:
     register()
-    assert isinstance(gymnasium.make("dmc/walker_walk-v0"), type(make("walker_walk")))
+    assert isinstance(gymnasium.make("dmc/walker_walk-v0"), type(make("walker_walk").unwrapped))
     assert make("dmc/walker_walk-v0").spec == make("walker_walk").spec
     assert task_name("dmc/walker_walk-v0") == task_name("walker_walk") == "walker_walk"
     assert task_name("Pendulum-v1") == "Pendulum-v1" and task_name("toy/probe_1-v0") == "toy/probe_1-v0"

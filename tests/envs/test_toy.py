@@ -32,8 +32,8 @@ DISCOUNT = 0.9
 @pytest.mark.parametrize("env_id", ["toy/point_mass-v0", *PROBES])
 def test_toys_are_proper_environments_without_wrappers(env_id: str) -> None:
     env = make(env_id)
-    assert env is env.unwrapped and spec(env).action_repeat == 1
-    check_env(env, skip_render_check=True)
+    assert env.env is env.unwrapped and spec(env).action_repeat == 1
+    check_env(env.unwrapped, skip_render_check=True)
 
 
 def point_mass_return(policy: str, seed: int) -> tuple[float, int, bool]:
@@ -85,7 +85,7 @@ def rollout(env: Probe, seed: int) -> tuple[list[float], list[float]]:
 
 @pytest.mark.parametrize("env_id", PROBES)
 def test_probes_are_worth_what_they_say(env_id: str) -> None:
-    env = make(env_id)
+    env = make(env_id).unwrapped
     assert type(env) is PROBES[env_id]
     for seed in range(10):
         seen, rewards = rollout(env, seed)
@@ -117,7 +117,7 @@ def test_only_the_best_action_earns_most(env_id: str, best: object) -> None:
 
 @pytest.mark.parametrize("env_id", ["toy/point_mass-v0", "toy/probe_4-v0"])
 def test_toys_refuse_actions_out_of_range(env_id: str) -> None:
-    env: gymnasium.Env = make(env_id)
+    env: gymnasium.Env = make(env_id).unwrapped
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"must lie in \[-1, 1\]"):
         env.step(np.full(env.action_space.shape, 1.01))

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import inspect
 import json
-import warnings
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces, wrappers
 
-from pcil.errors import InputError, json_object
+from pcil.envs.checked import Checked, checked
+from pcil.errors import InputError, brief, json_object
 from pcil.types import Origin, Spec
 
-__all__ = ["TASKS", "ends_early", "make", "register", "spec", "task_name"]
+__all__ = ["TASKS", "Checked", "checked", "ends_early", "make", "opened", "register", "spec", "task_name"]
 
 TASKS = (
     "finger_spin",
@@ -33,6 +35,9 @@ TASKS = (
 
 LONGEST_EPISODE = 100_000
 """Steps after which an environment without a time limit is taken to have no end."""
+
+_GIVEN = ("object ", "function ")
+"""How the names begin of environments that were given in Python: as they are, or by a function."""
 
 _TOYS = {
     "toy/point_mass-v0": "PointMass",
@@ -64,18 +69,62 @@ def dmc_id(task: str) -> str:
     return f"dmc/{task}-v0"
 
 
-def task_name(task: str) -> str:
-    """The short name under which results are kept: "walker_walk" for "dmc/walker_walk-v0", other ids as they are."""
-    return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
+def task_name(task: Any) -> str:
+    """The short name under which results are kept: "walker_walk" for "dmc/walker_walk-v0", other ids as they are.
+
+    Of a function that makes an environment, or of an environment, it says which it is; `make` takes no such name.
+    """
+    if isinstance(task, str):
+        return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
+    if isinstance(task, gymnasium.Env):
+        return f"{_GIVEN[0]}{type(task.unwrapped).__module__}.{type(task.unwrapped).__qualname__}"
+    if callable(task):
+        named = task if inspect.isroutine(task) or isinstance(task, type) else type(task)
+        return f"{_GIVEN[1]}{named.__module__}.{named.__qualname__}"
+    raise InputError(f"The task is {brief(task)}; it must be a name, a function that makes an environment, or a gymnasium.Env.")
 
 
-def make(task: str, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> gymnasium.Env:
+def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Checked:
     """The environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
 
     `task` is a task of DeepMind Control's suite ("walker_walk" or "dmc/walker_walk-v0"), one of our toys
-    ("toy/point_mass-v0") or any Gymnasium id whose spaces are boxes; those are flattened and rescaled with Gymnasium's
-    own wrappers. `env_kwargs` are keyword arguments of the environment, given to `gymnasium.make`.
+    ("toy/point_mass-v0"), any Gymnasium id, a function that makes an environment, or an environment. `env_kwargs` are keyword
+    arguments of the environment, given to `gymnasium.make` or to the function. Observations are Boxes, or Dicts and Tuples of
+    Boxes: these are flattened, actions are rescaled, and all that comes back is checked (`pcil.envs.checked:Checked`).
     """
+    env = task if isinstance(task, gymnasium.Env) else _made(task, render_mode, env_kwargs)
+    if isinstance(env, Checked):
+        return env
+    registered = env.spec
+    own = registered is not None and registered.namespace in ("dmc", "toy")
+    limited = own or (registered is not None and registered.max_episode_steps is not None)
+    try:
+        return Checked(_flat_actions(env, task_name(task)), task_name(task), None if limited else LONGEST_EPISODE)
+    except Exception as error:
+        if env is not task:
+            env.close()
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"The environment {task_name(task)!r} can't be used ({type(error).__name__}: {error}).") from error
+
+
+@contextlib.contextmanager
+def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Iterator[Checked]:
+    """The environment that `make` gives, closed at the end; one that was given as an object is its owner's to close."""
+    env = make(task, render_mode, env_kwargs=env_kwargs)
+    try:
+        yield env
+    finally:
+        if env is not task and not isinstance(task, gymnasium.Env):
+            env.close()
+
+
+def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None) -> gymnasium.Env:
+    """The environment as Gymnasium or a function makes it."""
+    if not isinstance(task, str):
+        return _returned(task, env_kwargs or {})
+    if task.startswith(_GIVEN):
+        raise InputError(f"The environment of this run was given in Python ({task}), so it can't be made by name.")
     register()
     arguments = json_object("env_kwargs", env_kwargs or {})
     env_id = _gymnasium_id(task)
@@ -86,7 +135,7 @@ def make(task: str, render_mode: str | None = None, *, env_kwargs: dict[str, Any
     if render_mode is not None:
         arguments["render_mode"] = render_mode
     try:
-        env = gymnasium.make(env_id, disable_env_checker=True, **arguments)
+        return gymnasium.make(env_id, disable_env_checker=True, **arguments)
     except InputError as error:
         raise InputError(f"The environment {task!r} can't be made: {error}") from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
@@ -98,32 +147,20 @@ def make(task: str, render_mode: str | None = None, *, env_kwargs: dict[str, Any
     except Exception as error:  # the environment may be a person's own and may raise anything
         given = f" with {json.dumps(env_kwargs)}" if env_kwargs else ""
         raise InputError(f"The environment {task!r} can't be made{given} ({type(error).__name__}: {error}).") from error
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
-        env = _flat_actions(_flat_observations(env, task), task)
-    limited = env.spec is None or env.spec.max_episode_steps is not None or env.spec.namespace in ("dmc", "toy")
-    return env if limited else _Ending(env, task)
 
 
-class _Ending(gymnasium.Wrapper):
-    """Refuses an episode that does not end: Gymnasium knows no time limit of this environment."""
-
-    def __init__(self, env: gymnasium.Env, task: str) -> None:
-        super().__init__(env)
-        self._task, self._steps = task, 0
-
-    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
-        self._steps = 0
-        return self.env.reset(**options)
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        self._steps += 1
-        if self._steps > LONGEST_EPISODE:
-            raise InputError(
-                f"An episode of {self._task!r} has not ended after {LONGEST_EPISODE:,} steps, and runs need its end: "
-                "register the environment with max_episode_steps."
-            )
-        return self.env.step(action)
+def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
+    """The environment that a function makes."""
+    name = task_name(function)
+    try:
+        env = function(**env_kwargs)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"The environment of {name} can't be made ({type(error).__name__}: {error}).") from error
+    if not isinstance(env, gymnasium.Env):
+        raise InputError(f"The {name} returned {brief(env)}; it must return a gymnasium.Env.")
+    return env
 
 
 def spec(env: gymnasium.Env) -> Spec:
@@ -201,21 +238,9 @@ def _refuse_name(task: str, error: Exception) -> NoReturn:
     ) from error
 
 
-def _flat_observations(env: gymnasium.Env, task: str) -> gymnasium.Env:
-    space = env.observation_space
-    boxes = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
-    if not boxes or not all(isinstance(box, spaces.Box) for box in boxes):
-        raise InputError(f"The observations of {task!r} must be a Box or a Dict of Boxes; they are {space}.")
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        env = wrappers.FlattenObservation(env)
-    if env.observation_space.dtype != np.float32:
-        env = wrappers.DtypeObservation(env, np.float32)
-    return env
-
-
 def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
     space = env.action_space
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not np.issubdtype(space.dtype, np.floating):
+    if not isinstance(space, spaces.Box) or space.shape in ((), (0,)) or len(space.shape) > 1 or space.dtype.kind != "f":
         raise InputError(f"The actions of {task!r} must be a flat Box of real numbers; they are {space}.")
     if not space.is_bounded():
         raise InputError(f"The actions of {task!r} must have finite bounds; they are {space}.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pcil.envs import make, spec
+from pcil.envs import Checked, opened, spec
 from pcil.envs.dmc import DMCEnv
 from pcil.errors import InputError
 
@@ -24,23 +24,24 @@ def measure_env(task: str, episodes: int = 3) -> dict[str, float]:
     The physics is MuJoCo's step functions alone, on the same model and along the very same states: its own copy of the
     simulation gets the same random actions. Medians over blocks; `ratio` is the median of the ratios of neighbours.
     """
-    env = make(task).unwrapped
-    if not isinstance(env, DMCEnv):
-        raise InputError(f"Only tasks of DeepMind Control have bare physics to compare with; got {task!r}.")
     env_us, physics_us = [], []
-    for episode in range(episodes):
-        actions = np.random.default_rng(episode).uniform(-1.0, 1.0, (10 * _BLOCK, spec(env).action_dim))
-        env.reset(seed=episode)
-        run_physics = _bare_physics(env)
-        for block in np.split(actions.astype(np.float32), 10):
-            env_us.append(_microseconds(lambda block=block: _step_through(env, block)))
-            controls = [env.control_signal(action) for action in block]
-            physics_us.append(_microseconds(lambda controls=controls, run=run_physics: run(controls)))
+    with opened(task) as env:
+        inner = env.unwrapped
+        if not isinstance(inner, DMCEnv):
+            raise InputError(f"Only tasks of DeepMind Control have bare physics to compare with; got {task!r}.")
+        for episode in range(episodes):
+            actions = np.random.default_rng(episode).uniform(-1.0, 1.0, (10 * _BLOCK, spec(env).action_dim))
+            env.reset(seed=episode)
+            run_physics = _bare_physics(inner)
+            for block in np.split(actions.astype(np.float32), 10):
+                env_us.append(_microseconds(lambda block=block: _step_through(env, block)))
+                controls = [inner.control_signal(action) for action in block]
+                physics_us.append(_microseconds(lambda controls=controls, run=run_physics: run(controls)))
     ratio = median(ours / bare for ours, bare in zip(env_us, physics_us, strict=True))
     return {"env_step_us": median(env_us), "physics_us": median(physics_us), "ratio": ratio}
 
 
-def _step_through(env: DMCEnv, actions: np.ndarray) -> None:
+def _step_through(env: Checked, actions: np.ndarray) -> None:
     for action in actions:
         env.step(action)
 

@@ -16,7 +16,7 @@ from pcil.files import parse_json, read_json
 
 OFFLINE = ("bc",)
 """Methods that take no step in the environment; their frames only count updates, two frames each where actions are repeated."""
-NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds")
+NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds", "single_environment")
 """Settings by which two runs may differ and still be seeds, or tasks, of one variant."""
 
 

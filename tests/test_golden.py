@@ -22,7 +22,7 @@ GOLDEN = json.loads(make_golden.GOLDEN.read_text())
 CASES = make_golden.cases()
 TOLERANCE = 1e-4
 """Relative. Another processor or release of XLA adds in another order, which changes the last bits. With every first weight
-moved by its last bit the numbers moved by at most 2.5e-6; the changes of a line that were tried moved them by 1e-3 and more."""
+moved by its last bit the numbers moved by at most 2.5e-6."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:

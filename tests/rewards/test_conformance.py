@@ -102,6 +102,23 @@ def test_deterministic(settings: Reward, trained: Any) -> None:
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
 
 
+PAIRS = {f"{name} of pairs": dataclasses.replace(CASES[name], inputs="state-action") for name in ("dac", "sil")}
+
+
+@pytest.mark.parametrize("case", [name for name in CASES | PAIRS if name not in ("pwil", "potil", "expert")])
+def test_an_update_learns_from_the_first_steps_of_longer_windows_alone(case: str) -> None:
+    """The agent's windows may have more steps than the reward asked for: those behind its span make no difference."""
+    settings = (CASES | PAIRS)[case]
+    state = settings.init(DEMOS, embed, key=jax.random.key(0))
+    update = jax.jit(lambda *both: settings.update(state, *both, embed, key=jax.random.key(1)))
+    short, long, late = (
+        update(*(rows(batch, start, settings.batch_size, span) for batch in (EXPERT, AGENT)))
+        for start, span in ((0, settings.span), (0, settings.span + 2), (1, settings.span))
+    )
+    assert all(np.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(*map(jax.tree.leaves, (short, long)), strict=True))
+    assert not all(np.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(*map(jax.tree.leaves, (short, late)), strict=True))
+
+
 def test_inputs_unchanged(settings: Reward, trained: Any) -> None:
     expert, agent = (rows(b, 0, settings.batch_size, settings.span) for b in (EXPERT, AGENT))
     before = [array.copy() for array in (*expert, *agent)]

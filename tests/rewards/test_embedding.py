@@ -33,8 +33,8 @@ def update(settings: PCIL | TCN, state: EmbeddingState, expert: Window, agent: W
 
 def test_similarity_by_hand() -> None:
     """Two expert rows, three steps: "random" meets rows 0, 1, 0; "mean" meets their mean."""
-    expert = jnp.array([[1.0, 0.0], [0.0, 1.0]])
-    steps = jnp.array([[1.0, 0.0], [1.0, 0.0], [0.6, 0.8]])
+    expert = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    steps = jnp.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
     assert np.allclose(similarity(steps, expert, "random"), [1.0, 0.0, 0.6])
     assert np.allclose(similarity(steps, expert, "mean"), [0.5, 0.5, 0.7])
 

@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from pcil import learner
 from pcil.config import Run
 from pcil.networks import MLP, Trunk
-from pcil.rewards.sil import POTIL, SIL, SinkhornReward, SinkhornState
+from pcil.rewards.sil import POTIL, SIL, Demos, SinkhornReward, SinkhornState, step_weights
 from pcil.types import Batch, Episode, Spec, Window
 from small import narrow, random_batch, small_run, windows
 
@@ -118,6 +118,25 @@ def test_episodes_of_many_lengths_share_one_compilation(method: str) -> None:
         if steps == 20:
             compiled = learner._label_rows._cache_size(), learner._after_rows._cache_size()
     assert (learner._label_rows._cache_size(), learner._after_rows._cache_size()) == compiled
+
+
+def test_steps_share_the_mass_and_rows_behind_them_have_none() -> None:
+    action = jnp.array([[0.1, 0.2], [0.3, 0.4], [jnp.nan, jnp.nan], [0.5, 0.6], [jnp.nan, jnp.nan]])
+    assert np.allclose(step_weights(action), [1 / 3, 1 / 3, 0, 1 / 3, 0])
+
+
+class Free(POTIL):
+    """Every episode costs nothing at all."""
+
+    def costs(self, state: Any, obs: Any, action: Any, embed: Any, *, key: Any) -> jax.Array:
+        return jnp.zeros(len(obs))
+
+
+def test_a_first_episode_that_costs_nothing_leaves_a_finite_scale() -> None:
+    """As if it had cost a millionth."""
+    state = SinkhornState(Demos.of(DEMOS), jnp.zeros(()), None)
+    after = Free().after_episode(state, *map(jnp.asarray, EPISODE), TRUNKS[0], key=KEY)
+    assert float(after.scale) == pytest.approx(10 / 1e-6)
 
 
 def test_without_a_first_sum_rewards_stay_unscaled() -> None:

@@ -1,6 +1,7 @@
-"""How often imitation reaches a goal that ends the episode, with and without the absorbing state.
+"""Imitation where episodes end early, with and without the absorbing state: a goal to reach, and a fall to avoid.
 
 python experiments/early_ends.py; each run resumes, and is skipped once it is done.
+InvertedPendulum-v5 wants `pip install imageio`.
 """
 
 from __future__ import annotations
@@ -14,27 +15,35 @@ from pcil import demos
 from pcil.envs.toy import Reach
 from pcil.evaluate import environments_for, evaluate
 
-TASK, FOLDER = "toy/reach-v0", Path("runs/early_ends")
-METHODS, SEEDS, EPISODES = ("pcil", "dac"), (1, 2, 3), 100
+FOLDER = Path("runs/early_ends")
+METHODS, SEEDS, FRAMES, STARTS = ("pcil", "dac"), (1, 2, 3), 10_000, 50
+
+
+def balance(obs: np.ndarray) -> np.ndarray:
+    """A linear controller that keeps the pole of InvertedPendulum-v5 up for the whole 1000 steps."""
+    return np.clip(obs @ np.array([0.1, 3.0, 0.2, 0.5]), -1, 1)[None].astype(np.float32)
+
+
+EXPERTS = {"toy/reach-v0": lambda obs: Reach.optimal_action(obs).astype(np.float32), "InvertedPendulum-v5": balance}
 
 
 def main() -> None:
-    """One line a method and setting: the shares of 100 starts from which each seed reaches the goal."""
-    dataset = FOLDER / "demos"
-    if not dataset.exists():
-        expert = lambda obs: Reach.optimal_action(obs).astype(np.float32)  # noqa: E731
-        demos.record(expert, pcil.make_env(TASK), 10, task=TASK, seed=0, info={"expert": "the optimal policy"}).save(dataset)
-    for method in METHODS:
-        for absorbing in (None, False):
-            settings = {} if absorbing is None else {"agent.absorbing": absorbing}
-            shares = []
-            for seed in SEEDS:
-                out = FOLDER / method / ("default" if absorbing is None else "off") / str(seed)
-                run = pcil.train(TASK, method=method, seed=seed, frames=30_000, demos=str(dataset), out=out, **settings)
-                with environments_for(TASK, EPISODES) as copies:
-                    result = evaluate(run.policy, copies, seed=0, episodes=EPISODES)
-                shares.append(float(np.mean(result.lengths < Reach.NUM_STEPS)))
-            print(f"{method:5} absorbing {'default' if absorbing is None else 'off':8}", *(f"{share:6.0%}" for share in shares))
+    """One line a task, method and setting: the mean length of an episode, in steps, for each seed."""
+    for task, expert in EXPERTS.items():
+        place = FOLDER / task.replace("/", "-")
+        if not (dataset := place / "demos").exists():
+            recorded = demos.record(expert, pcil.make_env(task), 10, task=task, seed=0, info={})
+            recorded.save(dataset)
+            print(f"{task}: demonstrations of {recorded.num_steps / 10:.1f} steps")
+        for method in METHODS:
+            for name, settings in (("default", {}), ("off", {"agent.absorbing": False})):
+                lengths = []
+                for seed in SEEDS:
+                    out = place / method / name / str(seed)
+                    run = pcil.train(task, method=method, seed=seed, frames=FRAMES, demos=str(dataset), out=out, **settings)
+                    with environments_for(task, STARTS) as copies:
+                        lengths.append(evaluate(run.policy, copies, seed=0, episodes=STARTS).lengths.mean())
+                print(f"{task} {method} absorbing {name}:", *(f"{length:.1f}" for length in lengths), flush=True)
 
 
 if __name__ == "__main__":

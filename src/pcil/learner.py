@@ -150,6 +150,12 @@ def on_host(actor: Actor) -> Actor:
     return jax.tree.map(np.asarray, actor)
 
 
+@jax.jit
+def copied(learner: Learner) -> Learner:
+    """A copy that stays valid while updates overwrite the learner in place."""
+    return jax.tree.map(jnp.copy, learner)
+
+
 def close_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Learner:
     """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
     if type(method.reward).after_episode is Reward.after_episode:

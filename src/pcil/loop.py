@@ -127,7 +127,7 @@ def _saved_on_failure(run: Run, folder: Path, state: State, log: MetricWriter, c
 
     What it gives raises `RunError` where an update since has left the finite range.
     """
-    before, positions = replace(state, learner=jax.tree.map(jnp.copy, state.learner)), log.positions()
+    before, positions = replace(state, learner=learner.copied(state.learner)), log.positions()
 
     def refuse_divergence() -> None:
         if found := learner.first_not_finite(state.learner):

@@ -415,6 +415,8 @@ def test_arguments_survive_json() -> None:
     run = presets.make("walker_walk", env_kwargs={"a": (1, 2), "b": {"c": None}})
     assert run == dataclasses.replace(run, env_kwargs=run.to_json()["env_kwargs"]) and isinstance(run, Run)
     assert run.env_kwargs == {"a": [1, 2], "b": {"c": None}}
+    plain = presets.make("walker_walk")
+    assert len({run, plain, presets.make("walker_walk")}) == 2, "a run can be hashed, and its arguments tell it apart"
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ class Run:
     """Name of the method; it chooses the reward and its settings."""
     preset: str = "default"
     """default: what our measurements favour; paper: the paper's text; released: what the authors' code does."""
-    env_kwargs: EnvKwargs = field(default_factory=dict)
+    env_kwargs: EnvKwargs = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment as a JSON object, such as '{"frame_skip": 5}'; they are given to gymnasium.make."""
     seed: int = 1
     """Everything random follows from it."""

@@ -189,6 +189,26 @@ def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(off
     no_value_is_missing(tmp_path)
 
 
+def test_where_an_action_is_not_finite_the_parameters_that_went_first_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    register()
+    update = learner.update
+
+    def broken(method: Any, *given: Any) -> Any:
+        state, actor = update(method, *given)
+        if given[-1] < 7:
+            return state, actor
+        agent = dataclasses.replace(state.agent, actor=jax.tree.map(lambda leaf: leaf * NAN, state.agent.actor))
+        return dataclasses.replace(state, agent=agent), jax.tree.map(lambda leaf: leaf * NAN, actor)
+
+    monkeypatch.setattr(learner, "update", broken)
+    with pytest.raises(RunError, match=r"the agent's parameters became .* in update 8, after frame 20;") as error:
+        runs.execute(odd_run(update_every=1, replay_steps=100), tmp_path, runs.Silent())
+    assert "an action whose entry 0 is nan, in step 9 of training episode 3" in str(error.value.__context__)
+    no_value_is_missing(tmp_path)
+
+
 def test_a_learned_reward_that_is_not_finite_is_not_stored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     register()
     label = learner.label_episode

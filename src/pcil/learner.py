@@ -19,7 +19,7 @@ from pcil.rewards import Reward, label, states_read
 from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec, Window
 
-UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch"}
+UNSAID = {"parameters": "the agent's parameters", "rewards": "the rewards of the batch"}
 """What an update checks besides its metrics, and how errors call it."""
 LABEL_ROWS = 256
 """Episodes are labelled in multiples of so many rows."""
@@ -101,7 +101,7 @@ def _step(
     if method.label == "sampled":
         fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
-    unsaid = {"features": embed, "rewards": window.reward}
+    unsaid = {"parameters": (embed, method.agent.actor(learner.agent)), "rewards": window.reward}
     agent_state, agent_metrics = method.agent.update(learner.agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
@@ -118,7 +118,7 @@ def checks(names: Iterable[str]) -> list[str]:
     """What is checked in each update, in the order in which an update computes it; `names` are those of metrics or totals."""
     own = sorted(set(names) - {"updates", "finite", *UNSAID})
     parts = [[name for name in own if name.startswith(part)] for part in ("reward/", "agent/")]
-    return ["features", *parts[0], "rewards", *parts[1]]
+    return ["parameters", *parts[0], "rewards", *parts[1]]
 
 
 def first_not_finite(learner: Learner) -> tuple[str, int] | None:
@@ -129,7 +129,7 @@ def first_not_finite(learner: Learner) -> tuple[str, int] | None:
     if (first := int(min(counts))) < updates:
         bad = [name for name, count in zip(names, counts, strict=True) if count == first]
         bad = [name for name in bad if name.partition("/")[0] == bad[0].partition("/")[0]]
-        return " and ".join(UNSAID.get(name, name) for name in bad), first - (bad[0] == "features")
+        return " and ".join(UNSAID.get(name, name) for name in bad), first - (bad[0] == "parameters")
     arrays = eqx.filter({"agent": learner.agent, "reward": learner.reward}, eqx.is_inexact_array)
     for path, good in jax.tree_util.tree_flatten_with_path(_are_finite(arrays))[0]:
         if not good:

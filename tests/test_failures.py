@@ -19,6 +19,7 @@ import pytest
 import pcil
 from odd import Odd, raising
 from pcil import checkpoint, cli, demos, envs, learner, loop, presets, runs
+from pcil.agents import DrQV2
 from pcil.config import Run
 from pcil.errors import InputError, RunError, check_kinds
 from pcil.types import Spec
@@ -186,6 +187,27 @@ def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(off
     else:
         with pytest.raises(RunError, match=rf"training on {ID} diverged: agent/critic_loss became .* in update \d+,"):
             runs.execute(run, tmp_path, runs.Silent())
+    no_value_is_missing(tmp_path)
+
+
+def test_where_an_action_is_not_finite_the_parameters_that_went_first_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """An update that makes them NaN without a loss that is."""
+    register()
+    update = DrQV2.update
+
+    def broken(self: Any, state: Any, window: Any, *, step: Any, key: Any) -> Any:
+        state, metrics = update(self, state, window, step=step, key=key)
+        actor = jax.tree.map(lambda leaf: jax.numpy.where(step < 27, leaf, NAN), state.actor)
+        return dataclasses.replace(state, actor=actor), metrics
+
+    monkeypatch.setattr(DrQV2, "update", broken)
+    run = odd_run(update_every=1)
+    run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, tau=0.0123))  # compiled for this test alone
+    with pytest.raises(RunError, match=r"the actor's parameters became .* in update 8, after frame 20;") as error:
+        runs.execute(run, tmp_path, runs.Silent())
+    assert "an action whose entry 0 is nan, in step 9 of training episode 3" in str(error.value.__context__)
     no_value_is_missing(tmp_path)
 
 

@@ -19,7 +19,7 @@ from pcil.rewards import Reward, label, states_read
 from pcil.seeds import Stream
 from pcil.types import Batch, Episode, Spec, Window
 
-UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch"}
+UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch", "actor": "the actor's parameters"}
 """What an update checks besides its metrics, and how errors call it."""
 LABEL_ROWS = 256
 """Episodes are labelled in multiples of so many rows."""
@@ -51,7 +51,7 @@ def init(method: Method, spec: Spec, demos: Sequence[Batch], seed: int | Array) 
     expert = _zeros(spec, method.reward.batch_size, method.reward.span)
     metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
     zeros = {name: jnp.zeros(()) for name in [*sorted(metrics.keys() - set(UNSAID)), "updates"]}
-    return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(metrics))})
+    return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(checks(metrics)))})
 
 
 def _zeros(spec: Spec, rows: int, n: int) -> Window:
@@ -77,12 +77,13 @@ def update(
     drawn. The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
     learner, metrics = _step(method, learner, window, expert, seen, step, count)
-    before = learner.totals
+    actor, before = method.agent.actor(learner.agent), learner.totals
+    metrics["actor"] = _largest(actor)
     good = jnp.stack([jnp.isfinite(metrics[name]) for name in checks(metrics)])
     totals = {name: before[name] + value for name, value in {**metrics, "updates": 1.0}.items() if name not in UNSAID}
     totals["finite"] = before["finite"] + jnp.where(good & (before["finite"] == before["updates"]), 1.0, 0.0)
     learner = eqx.tree_at(lambda s: s.totals, learner, totals)
-    return learner, jax.tree.map(jnp.copy, method.agent.actor(learner.agent))
+    return learner, jax.tree.map(jnp.copy, actor)
 
 
 def _step(
@@ -121,7 +122,7 @@ def checks(names: Iterable[str]) -> list[str]:
     """What is checked in each update, in the order in which an update computes it; `names` are those of metrics or totals."""
     own = sorted(set(names) - {"updates", "finite", *UNSAID})
     parts = [[name for name in own if name.startswith(part)] for part in ("reward/", "agent/")]
-    return ["features", *parts[0], "rewards", *parts[1]]
+    return ["features", *parts[0], "rewards", *parts[1], "actor"]
 
 
 def first_not_finite(learner: Learner) -> tuple[str, int] | None:

@@ -93,7 +93,9 @@ def five_updates(run: Run) -> dict[str, Any]:
         seen = source.sample(rng, rows, span) if span > run.agent.n_step else None
         count, step = np.int32(i), np.int32(150 * i)
         state.learner, _ = learner.update(run.learner, state.learner, window, expert, seen, step, count)
-    metrics = {name: float(total) / UPDATES for name, total in state.learner.totals.items() if name not in ("updates", "finite")}
+    metrics = {
+        name: float(total) / UPDATES for name, total in state.learner.totals.items() if name not in ("updates", "finite")
+    }
     (last,) = episodes(4, (33,))
     last = last.absorbed(run.agent.n_step) if run.agent.absorbing else last
     labels = learner.label_episode(run.learner, learner.close_episode(run.learner, state.learner, last, 0), last, 0)

@@ -67,7 +67,7 @@ def register_env() -> Iterator[Any]:
 
 
 def test_public_names() -> None:
-    assert set(envs.__all__) == {"TASKS", "Checked", "checked", "make", "opened", "register", "spec", "task_name"}
+    assert set(envs.__all__) == {"TASKS", "Checked", "checked", "ends_early", "make", "opened", "register", "spec", "task_name"}
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -105,7 +105,7 @@ def _step(
     if method.label == "sampled":
         fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
-    unsaid = {"features": embed, "rewards": window.reward}
+    unsaid = {"features": frozen_embed(method, learner.agent), "rewards": window.reward}
     agent_state, agent_metrics = method.agent.update(agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}

@@ -124,8 +124,8 @@ def execute(
     `task` and `demos` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
     """
     compilation.use_cache()
-    folder, demos = files.expanded(folder), demonstrations(run, reporter.say, task=task, given=demos)
-    run, why = with_absorbing_decided(run, demos, task)
+    folder = files.expanded(folder)
+    run, demos, why = prepared(run, reporter.say, task=task, given=demos)
     with _claimed(folder), _no_room_is_input_error(folder):
         _describe(folder, run, demos, reporter)
         if not (folder / "DONE").exists():
@@ -168,8 +168,17 @@ def demonstrations(
 
     `task` and `given` stand in for what `run.task` and `run.demos` name; `say` is told what a person should know of them.
     """
+    return prepared(run, say, task=task, given=given)[1]
+
+
+def prepared(
+    run: Run, say: Callable[[str], None] = lambda text: None, *, task: Any = None, given: Demonstrations | None = None
+) -> tuple[Run, Demonstrations | None, str]:
+    """The run with `agent.absorbing` decided, its `demonstrations`, and why the absorbing state is on or off."""
     with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as environment:
-        return _fitted(run, environment, say, given)
+        demos = _fitted(run, environment, say, given)
+        run, why = with_absorbing_decided(run, demos, envs.ends_early(environment))
+    return run, demos, why
 
 
 def _fitted(
@@ -193,8 +202,8 @@ def _fitted(
     return demos
 
 
-def with_absorbing_decided(run: Run, demos: Demonstrations | None, task: Any = None) -> tuple[Run, str]:
-    """The run with `agent.absorbing` decided, and the reason in words; `task` stands in for what `run.task` names.
+def with_absorbing_decided(run: Run, demos: Demonstrations | None, ends_early: bool) -> tuple[Run, str]:
+    """The run with `agent.absorbing` decided, and the reason in words; `ends_early` says whether its episodes may terminate.
 
     Without the absorbing state an early end is worth 0 to the agent: where learned rewards are positive it avoids a goal that
     ends the episode, and where they are negative it gives up early (Kostrikov et al. 2019, section 4.2).
@@ -207,8 +216,7 @@ def with_absorbing_decided(run: Run, demos: Demonstrations | None, task: Any = N
     elif demos and ended:
         absorbing, why = True, f"{ended} of {len(demos.episodes)} demonstrations end early"
     else:
-        with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as env:
-            absorbing = envs.ends_early(env)
+        absorbing = ends_early
         why = f"an episode of {run.task} may end early" if absorbing else f"no episode of {run.task} ends early"
     return changed(run, {"agent.absorbing": absorbing}), why
 
@@ -231,8 +239,7 @@ def _claimed(folder: Path) -> Iterator[None]:
 
 def check(run: Run, folder: Path) -> None:
     """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
-    demos = demonstrations(run)
-    run, _ = with_absorbing_decided(run, demos)
+    run, demos, _ = prepared(run)
     identity = _identity(run, demos)
     if (folder / "run.json").exists():
         _refuse_another(run, folder, identity)

@@ -194,6 +194,100 @@ def test_a_kill_between_the_last_checkpoint_and_done_changes_nothing(demos: str,
     assert (rows(tmp_path / "run"), (tmp_path / "run" / "DONE").read_text()) == before
 
 
+def without_policy(folder: Path) -> None:
+    shutil.rmtree(folder / "policy")
+
+
+def half_a_policy(folder: Path) -> None:
+    (folder / "policy" / "policy.json").unlink()
+
+
+def damaged_policy(folder: Path) -> None:
+    path = folder / "policy" / "policy.safetensors"
+    path.write_bytes(path.read_bytes()[:-5] + b"12345")
+
+
+def lost_rows(folder: Path) -> None:
+    path = folder / "eval.csv"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def no_log(folder: Path) -> None:
+    (folder / "train.jsonl").unlink()
+
+
+def another_return(folder: Path) -> None:
+    (folder / "DONE").write_text('{"final_return": 1e9}')
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (without_policy, "holds no policy"),
+        (half_a_policy, "holds no policy"),
+        (damaged_policy, "is damaged"),
+        (lost_rows, "eval.csv is not what the run had written"),
+        (no_log, "train.jsonl is not what the run had written"),
+        (another_return, "DONE has another return than the last checkpoint"),
+    ],
+)
+def test_a_finished_run_that_lost_a_part_is_whole_again(damage: Any, said: str, demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "run")
+    damage(tmp_path / "run")
+    listener = StopAfter(-1)
+    runs.execute(run, tmp_path / "run", listener)
+    assert said in " ".join(listener.said)
+    finish(run, tmp_path / "whole")
+    same_run(tmp_path / "whole", tmp_path / "run")
+    assert (tmp_path / "run" / "DONE").read_text() == (tmp_path / "whole" / "DONE").read_text()
+    for name in ("policy.json", "policy.safetensors"):
+        assert (tmp_path / "run" / "policy" / name).read_bytes() == (tmp_path / "whole" / "policy" / name).read_bytes()
+    finish(run, tmp_path / "run")
+
+
+def test_a_done_that_comes_before_the_end_is_noticed(demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos)
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", StopAfter(5))
+    (tmp_path / "run" / "DONE").write_text('{"final_return": 1.0}')
+    listener = StopAfter(-1)
+    runs.execute(run, tmp_path / "run", listener)
+    assert "DONE is there, but the last whole checkpoint is at 250 frames; the run goes on." in " ".join(listener.said)
+    finish(run, tmp_path / "whole")
+    same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_a_finished_run_without_checkpoint_and_policy_is_refused(demos: str, tmp_path: Path) -> None:
+    run, folder = small_run(demos=demos), tmp_path / "run"
+    finish(run, folder)
+    shutil.rmtree(folder / "checkpoint")
+    finish(run, folder)  # a policy without checkpoints is all that one needs
+    shutil.rmtree(folder / "policy")
+    with pytest.raises(InputError, match=r"holds no policy .*, and no checkpoint has it; delete .*DONE to train it again"):
+        runs.execute(run, folder, runs.Silent())
+
+
+def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: str, tmp_path: Path) -> None:
+    """As those of before the logs were in it have."""
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "whole")
+    for name, size in (("old", 10**6), ("short", 30)):
+        with pytest.raises(loop.Stopped):
+            runs.execute(run, tmp_path / name, StopAfter(4))
+        arrays, meta, _ = checkpoint.restore(tmp_path / name / "checkpoint")
+        assert arrays is not None
+        meta["positions"] = {file: len(text) for file, text in meta.pop("logs").items()}
+        checkpoint.save(tmp_path / name / "checkpoint", meta["counters"]["frames"], arrays, meta)
+        log = tmp_path / name / "eval.csv"
+        log.write_bytes(log.read_bytes()[:size])
+        listener = StopAfter(-1)
+        runs.execute(run, tmp_path / name, listener)
+        lost = [text for text in listener.said if "has lost" in text]
+        assert bool(lost) == (name == "short")
+    same_run(tmp_path / "whole", tmp_path / "old")
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -28,8 +28,8 @@ def make_evaluation(*returns: float) -> Evaluation:
 
 
 @contextmanager
-def writer(folder: Path, positions: dict[str, int] | None = None, frames: int = 0) -> Iterator[MetricWriter]:
-    log = MetricWriter(folder, positions or {}, frames)
+def writer(folder: Path, logs: dict[str, str] | None = None, said: list[str] | None = None) -> Iterator[MetricWriter]:
+    log = MetricWriter(folder, logs or {}, 0.0, [].append if said is None else said.append)
     try:
         yield log
     finally:
@@ -67,7 +67,7 @@ def test_every_row_is_on_disk_when_the_call_returns(tmp_path: Path) -> None:
         log.episode(2000, {"return": 7.0})
         assert contents(tmp_path)["eval.csv"].endswith(b"2000,0,7.0,10,1.0\n")
         assert contents(tmp_path)["train.jsonl"] == b'{"frames": 2000, "return": 7.0}\n'
-        assert log.positions() == {name: len(content) for name, content in contents(tmp_path).items()}
+        assert log.logs() == {name: content.decode() for name, content in contents(tmp_path).items()}
 
 
 def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
@@ -111,45 +111,101 @@ def test_the_columns_are_read_in_the_order_of_time(tmp_path: Path) -> None:
 def test_rewinding_removes_exactly_what_came_later(tmp_path: Path, kept: int) -> None:
     """Three rounds are written; a second writer starts at the checkpoint after `kept` of them and goes on."""
     with writer(tmp_path) as log:
-        positions, before = [log.positions()], [contents(tmp_path)]
+        logs, rows, before = [log.logs()], [log.rows()], [contents(tmp_path)]
         for k in range(3):
             log.evaluation(1000 * k, 1.0 * k, make_evaluation(k / 3, -k / 7))
             log.episode(1000 * k, {"return": k / 3})
-            positions.append(log.positions())
+            logs.append(log.logs())
+            rows.append(log.rows())
             before.append(contents(tmp_path))
-    with writer(tmp_path, positions[kept], 1000 * kept) as log:
-        assert contents(tmp_path) == before[kept]
-        assert log.positions() == positions[kept]
+        assert [log.logs(number) for number in rows] == logs
+    with writer(tmp_path, logs[kept], said := []) as log:
+        assert contents(tmp_path) == before[kept] and not said
+        assert log.logs() == logs[kept]
         for k in range(kept, 3):
             log.evaluation(1000 * k, 1.0 * k, make_evaluation(k / 3, -k / 7))
             log.episode(1000 * k, {"return": k / 3})
+        assert log.logs() == logs[3]
     assert contents(tmp_path) == before[3]
 
 
-def test_a_torn_row_at_the_end_goes_with_the_rewinding(tmp_path: Path) -> None:
-    with writer(tmp_path) as log:
-        log.evaluation(0, 0.0, make_evaluation(1.0))
-        positions, whole = log.positions(), contents(tmp_path)
-    for name in NAMES:
-        with (tmp_path / name).open("ab") as file:
-            file.write(b'{"fra')
-    with writer(tmp_path, positions, 1000):
-        assert contents(tmp_path) == whole
+def flipped(content: bytes) -> bytes:
+    return content[:3] + bytes([content[3] ^ 4]) + content[4:]
 
 
-@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(path.read_bytes()[:5])], ids=["gone", "cut"])
-def test_where_a_file_lost_its_rows_nothing_is_made_up_for_them(tmp_path: Path, damage: Callable) -> None:
+DAMAGE: dict[str, Callable[[bytes], bytes | None]] = {
+    "gone": lambda content: None,
+    "emptied": lambda content: b"",
+    "cut": lambda content: content[:-9],
+    "a flipped bit": flipped,
+    "more at the end": lambda content: content + b'{"fra',
+    "a line twice": lambda content: content + content.splitlines(keepends=True)[-1],
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_damaged_log_is_written_again(tmp_path: Path, name: str, kind: str) -> None:
+    """It is said, but for what follows a whole log: that was written after the checkpoint."""
     with writer(tmp_path) as log:
         log.evaluation(0, 0.0, make_evaluation(1.0))
         log.episode(0, {"return": 1.0})
-        positions, before = log.positions(), contents(tmp_path)
-    for name in NAMES:
-        damage(tmp_path / name)
-    left = {name: (tmp_path / name).read_bytes() if (tmp_path / name).exists() else b"" for name in NAMES}
-    with writer(tmp_path, positions, 1000):
-        header = b"frames,episode,return,length,seconds\n"
-        assert contents(tmp_path) == {"eval.csv": left["eval.csv"] or header, "train.jsonl": left["train.jsonl"]}
-    assert all(before[name].startswith(content) for name, content in contents(tmp_path).items())
+        logs, whole = log.logs(), contents(tmp_path)
+    damaged = DAMAGE[kind](whole[name])
+    if damaged is None:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_bytes(damaged)
+    with writer(tmp_path, logs, said := []):
+        assert contents(tmp_path) == whole
+    after = kind in ("more at the end", "a line twice")
+    assert said == (
+        [] if after else [f"{tmp_path / name} is not what this run had written; it is written again from the checkpoint."]
+    )
+
+
+def test_a_log_that_is_a_link_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("mine")
+    (tmp_path / "eval.csv").symlink_to("precious.txt")
+    with pytest.raises(OSError), writer(tmp_path):
+        pass
+    assert (tmp_path / "precious.txt").read_text() == "mine"
+
+
+def points(folder: Path) -> list[tuple[str, int, float, float]]:
+    """What TensorBoard's own reader finds: name, frames, value, and seconds since the first event."""
+    from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+
+    found, began = [], None
+    (path,) = (folder / "tensorboard").glob("events.out.tfevents.*")
+    content = path.read_bytes()
+    while content:  # length, its checksum, the event, its checksum
+        size = int.from_bytes(content[:8], "little")
+        event = Event.FromString(content[12 : 12 + size])
+        content = content[16 + size :]
+        began = event.wall_time if began is None else began
+        found += [(v.tag, event.step, v.simple_value, round(event.wall_time - began, 3)) for v in event.summary.value]
+    return found
+
+
+def test_tensorboard_is_written_again_from_the_logs(tmp_path: Path) -> None:
+    """Whatever a kill left of it: points of before the checkpoint are there once, and none of after it."""
+    with writer(tmp_path) as log:
+        log.evaluation(1000, 5.0, make_evaluation(1.0, 2.0))
+        log.episode(1000, {"return": 0.5, "reward/loss": 0.25, "length": 3, "seconds": 5.5})
+        logs = log.logs()
+        log.episode(2000, {"return": 0.75, "seconds": 9.0})
+    expected = [
+        ("evaluation/return", 1000, 1.5, 5.0),
+        ("episode/return", 1000, 0.5, 5.5),
+        ("reward/loss", 1000, 0.25, 5.5),
+        ("episode/seconds", 1000, 5.5, 5.5),
+    ]
+    assert points(tmp_path) == [*expected, ("episode/return", 2000, 0.75, 9.0), ("episode/seconds", 2000, 9.0, 9.0)]
+    for path in (tmp_path / "tensorboard").iterdir():
+        path.write_bytes(path.read_bytes()[:-30])
+    with writer(tmp_path, logs):
+        assert sorted(points(tmp_path)) == sorted(expected)
 
 
 def test_a_run_that_starts_anew_starts_with_empty_files_and_one_header(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ LAYERS = [
     "errors types seeds files compilation",
     "losses transport optimiser networks noise theory",
     "envs arrays minari_files demos replay policy rewards agents",
-    "config presets evaluate checkpoint metrics learner loop fit runs progress",
+    "config presets evaluate checkpoint metrics learner state loop fit runs progress",
     "representation film reporting",
     "bench doctor arguments plans sweep cli",
 ]

@@ -12,6 +12,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from pcil import files
+
 KEEP = 2
 Arrays = dict[str, np.ndarray]
 
@@ -30,8 +32,11 @@ def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) ->
     ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
     text = json.dumps({"counters": counters, "files": _checksums(partial / "arrays")})
     (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
+    for path in (*partial.rglob("*"), partial):
+        files.sync(path)
     shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
+    files.sync(folder)
     others = _newest_first(folder)
     kept = others[others.index(final) :][:KEEP]
     for path in set(others) - set(kept):

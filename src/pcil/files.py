@@ -67,6 +67,26 @@ def read_text(path: Path, limit: int = LARGEST) -> str:
     return content.decode()
 
 
+def write_text(path: Path, text: str) -> None:
+    """The whole file or nothing, after a power cut too."""
+    partial = path.with_suffix(path.suffix + ".tmp")
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def sync(path: Path) -> None:
+    """Return once the disk holds a file, or the names in a folder, where the system can say so of a folder."""
+    with contextlib.suppress(PermissionError):  # Windows opens no folder
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def read_json(path: Path, limit: int = LARGEST) -> Any:
     """What a JSON file holds; `ValueError` or `OSError` where it can't be read."""
     return parse_json(read_text(path, limit))

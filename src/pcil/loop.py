@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import checkpoint, envs, learner, seeds
+from pcil import envs, learner, seeds
 from pcil.config import Run
 from pcil.errors import InputError, RunError
 from pcil.evaluate import Evaluation, environments_for, evaluate
@@ -22,9 +21,9 @@ from pcil.metrics import Clock, MetricWriter, described
 from pcil.networks import Actor
 from pcil.policy import Policy
 from pcil.replay import Replay
-from pcil.rewards import states_read
 from pcil.seeds import Stream
-from pcil.types import Batch, Episode, Spec
+from pcil.state import Counters, State, absorbed, resume, save, start
+from pcil.types import Episode, Spec
 
 OFFLINE_STEPS = 500
 """Updates of an offline agent in one pass of the loop."""
@@ -38,35 +37,6 @@ class Reporter(Protocol):
     def evaluation(self, run: Run, frames: int, result: Evaluation) -> None: ...
     def say(self, text: str) -> None: ...
     def stop(self) -> bool: ...
-
-
-@dataclass(frozen=True)
-class Counters:
-    """Where a run is; with the arrays, all that a checkpoint holds."""
-
-    frames: int = 0
-    steps: int = 0
-    """Agent steps."""
-    episodes: int = 0
-    updates: int = 0
-    evaluations: int = 0
-    seconds: float = 0.0
-    """Wall-clock time until now, over all sessions."""
-    final_return: float | None = None
-    """Mean return of the last evaluation, once there is nothing left to do."""
-
-
-@dataclass
-class State:
-    """What the loop carries from episode to episode."""
-
-    learner: Learner
-    actor: Actor
-    """The actor as it left the last update."""
-    replay: Replay
-    expert: Replay | None
-    """The demonstrations; a checkpoint does not hold them."""
-    counters: Counters
 
 
 class Stopped(Exception):
@@ -85,10 +55,10 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
         copies = environments_for(task, run.evaluate_episodes, run.env_kwargs, training=True, single=single)
         env, *rollout = stack.enter_context(copies)
         rollout, spec = rollout or [env], envs.spec(env)
-        state, positions = resume(run, folder, start(run, spec, demos), reporter)
+        state, logs = resume(run, folder, start(run, spec, demos), reporter.say)
         clock = Clock(state.counters.seconds)
         saved = clock.total()
-        log = stack.enter_context(MetricWriter(folder, positions, state.counters.frames))
+        log = stack.enter_context(MetricWriter(folder, logs, clock.total(), reporter.say))
         while state.counters.frames < run.frames:
             with _saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
                 if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
@@ -108,7 +78,7 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
 
             stop = reporter.stop()
             if stop or clock.total() - saved >= run.checkpoint_seconds:
-                _save(folder, state, log.positions(), clock)
+                save(folder, state, log.logs(), clock)
                 saved = clock.total()
             if stop:
                 raise Stopped
@@ -117,7 +87,9 @@ def train_loop(run: Run, folder: Path, demos: Sequence[Episode], reporter: Repor
             with _saved_on_failure(run, folder, state, log, clock):
                 result = _evaluate(run, folder, state, rollout, log, clock, reporter)
             state.counters = replace(state.counters, final_return=result.mean)
-            _save(folder, state, log.positions(), clock)
+            save(folder, state, log.logs(), clock)
+        else:
+            _save_policy(run, folder, state, spec, state.counters.final_return)
     return state
 
 
@@ -127,7 +99,7 @@ def _saved_on_failure(run: Run, folder: Path, state: State, log: MetricWriter, c
 
     What it gives raises `RunError` where an update since has left the finite range.
     """
-    before, positions = replace(state, learner=learner.copied(state.learner)), log.positions()
+    before, rows = replace(state, learner=learner.copied(state.learner)), log.rows()
 
     def refuse_divergence() -> None:
         if found := learner.first_not_finite(state.learner):
@@ -141,7 +113,7 @@ def _saved_on_failure(run: Run, folder: Path, state: State, log: MetricWriter, c
     try:
         yield refuse_divergence
     except InputError:
-        _save(folder, before, positions, clock)
+        save(folder, before, log.logs(rows), clock)
         refuse_divergence()  # it came first, where the actor's actions are not finite any more
         raise
 
@@ -258,75 +230,19 @@ def _evaluate(
     result = evaluate(lambda obs: host(obs, np), rollout, seed=run.seed, episodes=run.evaluate_episodes)
     log.evaluation(state.counters.frames, clock.total(), result)
     state.counters = replace(state.counters, evaluations=state.counters.evaluations + 1)
+    _save_policy(run, folder, state, envs.spec(rollout[0]), result.mean)
+    reporter.evaluation(run, state.counters.frames, result)
+    return result
+
+
+def _save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: float) -> None:
     info = {
         "method": run.method,
         "preset": run.preset,
         "seed": run.seed,
         "frames": state.counters.frames,
-        "return_mean": result.mean,
-        "action_repeat": envs.spec(rollout[0]).action_repeat,
+        "return_mean": return_mean,
+        "action_repeat": spec.action_repeat,
         "env_kwargs": run.env_kwargs,
     }
-    Policy(host, envs.task_name(run.task), info).save(folder / "policy")
-    reporter.evaluation(run, state.counters.frames, result)
-    return result
-
-
-def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
-    """The state before the first step."""
-    demos = [absorbed(run, episode) for episode in demos]
-    spec = spec._replace(obs_dim=spec.obs_dim + 1) if run.agent.absorbing else spec
-    batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
-    fresh = learner.init(run.learner, spec, batches, run.seed)
-    replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
-    left, reward = run.reward.prefill
-    for episode in itertools.cycle(demos):
-        if left <= 0:
-            break
-        replay.add(episode, np.asarray(reward + run.reward.task_weight * episode.reward, np.float32))
-        left -= len(episode)
-    actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
-    return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
-
-
-def absorbed(run: Run, episode: Episode) -> Episode:
-    """The episode as the run learns from it: where there is an absorbing state, an early end has as many steps there as it had
-    before, so that half of what a reward sees of it is its end, whatever its length."""
-    return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
-
-
-def _save(folder: Path, state: State, positions: dict[str, int], clock: Clock) -> None:
-    """Everything that the rest of the run depends on; a finished run needs no replay, and an offline agent's is empty."""
-    counters = replace(state.counters, seconds=clock.total())
-    arrays = checkpoint.flatten("learner", state.learner)
-    arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
-    if counters.final_return is None and state.replay.num_episodes:
-        arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
-    meta = {"counters": asdict(counters), "positions": positions}
-    checkpoint.save(folder / "checkpoint", counters.frames, arrays, meta)
-
-
-def resume(run: Run, folder: Path, fresh: State, reporter: Reporter) -> tuple[State, dict[str, int]]:
-    """The state of the newest whole checkpoint and the lengths its logs had; `fresh` and no lengths where there is none."""
-    arrays, meta, complaints = checkpoint.restore(folder / "checkpoint")
-    for complaint in complaints:
-        reporter.say(complaint)
-    if arrays is None:
-        if (folder / "train.jsonl").exists():
-            reporter.say(f"There is no whole checkpoint in {folder}, so the run begins again.")
-        return fresh, {}
-    arrays = checkpoint.flatten("learner.totals", fresh.learner.totals) | arrays  # all are 0, and older versions have fewer
-    try:
-        restored = checkpoint.unflatten("learner", fresh.learner, arrays)
-        known = checkpoint.flatten("actor", fresh.actor).keys() <= arrays.keys()  # older ones have no scale of observations
-        actor = checkpoint.unflatten("actor", fresh.actor, arrays) if known else run.agent.actor(restored.agent)
-        counters = Counters(**meta["counters"])
-    except (ValueError, TypeError) as error:
-        raise InputError(
-            f"The checkpoint in {folder} is of another version ({error}); go on with that one, or give another --out."
-        ) from error
-    if counters.final_return is None:
-        if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
-            fresh.replay.load(held)
-        reporter.say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    return State(restored, actor, fresh.replay, fresh.expert, counters), meta["positions"]
+    Policy(on_host(state.actor), envs.task_name(run.task), info).save(folder / "policy")

@@ -53,7 +53,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     demos = runs.demonstrations(run)
     assert demos is not None
     with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:
-        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
+        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), lambda text: None)
         if not state.counters.episodes:
             raise InputError(f"{source.folder} holds no checkpoint that can be read.")
         rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)

@@ -18,11 +18,12 @@ from typing import Any
 
 import gymnasium
 
-from pcil import compilation, envs, files, fit, loop, presets, progress
+from pcil import compilation, envs, files, fit, loop, presets, progress, state
 from pcil.config import Run, changed, completed, differences
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError, brief
 from pcil.evaluate import Evaluation
+from pcil.metrics import LOGS
 from pcil.policy import Policy, load_policy
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
@@ -126,14 +127,17 @@ def execute(
     compilation.use_cache()
     folder = files.expanded(folder)
     run, demos, why = prepared(run, reporter.say, task=task, given=demos)
-    with _claimed(folder), _no_room_is_input_error(folder):
+    with _claimed(folder), _no_room_is_input_error(folder), _withdrawn_if_refused(folder):
         _describe(folder, run, demos, reporter)
+        if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder))):
+            reporter.say(why_not)
+            (folder / "DONE").unlink()
         if not (folder / "DONE").exists():
             reporter.say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
             (folder / "error.txt").unlink(missing_ok=True)
             with _traceback_kept(folder / "error.txt"):
                 final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter, task).counters.final_return
-            _write(folder / "DONE", json.dumps({"final_return": final}) + "\n")
+            files.write_text(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
 
 
@@ -260,7 +264,7 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
             versions[name] = metadata.version(name)
     path = folder / "run.json"
     if not path.exists():
-        _write(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
+        files.write_text(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
         return
     before = _refuse_another(run, folder, identity)
     updated = differences(before.get("versions", {}), versions)
@@ -316,14 +320,16 @@ def provenance(folder: Path, policy: Policy, command: str) -> dict[str, Any]:
     }
 
 
-def _write(path: Path, text: str) -> None:
-    """The whole file or nothing, after a power cut too."""
-    partial = path.with_suffix(path.suffix + ".tmp")
-    with partial.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+@contextlib.contextmanager
+def _withdrawn_if_refused(folder: Path) -> Iterator[None]:
+    """A run that is refused before its first step leaves no `run.json`, so its folder is free for another."""
+    before = (folder / "run.json").exists()
+    try:
+        yield
+    except BaseException:
+        if not before and not (folder / LOGS[0]).exists():
+            (folder / "run.json").unlink(missing_ok=True)
+        raise
 
 
 @contextlib.contextmanager

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import shutil
+import signal
+import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +19,7 @@ import numpy as np
 import pytest
 
 from pcil import checkpoint
+from pcil.errors import InputError
 from pcil.networks import MLP
 
 
@@ -147,35 +153,69 @@ def test_where_there_is_none_nothing_is_restored(tmp_path: Path) -> None:
 # --- Damage ---
 
 
-def test_a_flipped_bit_is_noticed_or_does_not_matter(two: Path, folder: Path) -> None:
-    """Some bits are Orbax's own notes: then the newest must come back exactly. A few places in each file there is."""
-    refused = set()
-    files = sorted(path for path in (folder / "20").rglob("*") if path.is_file())
-    assert len(files) >= 5
-    for file in files:
+def written_by_orbax(folder: Path, arrays: dict[str, np.ndarray], counters: dict[str, Any]) -> None:
+    """A checkpoint as they were before version 0.2."""
+    ocp = pytest.importorskip("orbax.checkpoint")
+    ocp.PyTreeCheckpointer().save((folder / "arrays").absolute(), arrays)
+    files = {str(p.relative_to(folder / "arrays")): zlib.crc32(p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
+    text = json.dumps({"counters": counters, "files": files})
+    (folder / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
+
+
+def test_checkpoints_of_orbax_are_read_and_their_damage_found(folder: Path) -> None:
+    written_by_orbax(folder / "30", make_arrays(30), COUNTERS)
+    arrays, counters, complaints = checkpoint.restore(folder)
+    assert same(arrays, make_arrays(30)) and counters == COUNTERS and complaints == []
+    for file in sorted(path for path in (folder / "30" / "arrays").rglob("*") if path.is_file()):
         whole = file.read_bytes()
-        for at in {0, len(whole) // 3, len(whole) // 2, len(whole) - 1}:
-            damaged = bytearray(whole)
-            damaged[at] ^= 1 << (at % 8)
-            file.write_bytes(damaged)
-            arrays, counters, complaints = checkpoint.restore(folder)
-            if complaints:
-                assert len(complaints) == 1 and is_one_sentence_about(complaints[0], folder / "20")
-                assert same(arrays, make_arrays(10)) and counters == {"frames": 10}
-                refused.add(file.relative_to(folder / "20").parts[0])
-            else:
-                assert same(arrays, make_arrays(20)) and counters == COUNTERS
+        file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        arrays, counters, complaints = checkpoint.restore(folder)
+        assert len(complaints) == 1 and is_one_sentence_about(complaints[0], folder / "30")
+        assert same(arrays, make_arrays(20)) and counters == COUNTERS
         file.write_bytes(whole)
-    assert refused == {"meta.json", "arrays"}
-    assert checkpoint.restore(folder)[2] == []
+    checkpoint.save(folder, 40, make_arrays(40), {"frames": 40})
+    assert same(checkpoint.restore(folder)[0], make_arrays(40))
+
+
+def test_without_orbax_its_checkpoints_are_refused_with_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written_by_orbax(folder / "30", make_arrays(30), COUNTERS)
+    monkeypatch.setitem(sys.modules, "orbax.checkpoint", None)
+    with pytest.raises(InputError, match="needs Orbax; pip install orbax-checkpoint"):
+        checkpoint.restore(folder)
+
+
+@pytest.mark.parametrize("name", ["meta.json", "arrays.safetensors"])
+def test_every_flipped_bit_is_noticed(folder: Path, name: str) -> None:
+    """At 60 places of the file; the last byte of meta.json is a line break that says nothing."""
+    file = folder / "20" / name
+    whole = file.read_bytes()
+    for at in np.linspace(0, len(whole) - 2, 60).astype(int):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << (at % 8)
+        file.write_bytes(damaged)
+        arrays, counters, complaints = checkpoint.restore(folder)
+        assert len(complaints) == 1 and is_one_sentence_about(complaints[0], folder / "20")
+        assert same(arrays, make_arrays(10)) and counters == {"frames": 10}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="this system has no limit on the size of a file")
+def test_a_limit_on_the_size_of_files_is_an_error_of_the_system(folder: Path) -> None:
+    """As a full disk is; the library that writes has an error of its own for it."""
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with pytest.raises(OSError) as error:
+            checkpoint.save(folder, 30, make_arrays(30), {})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.errno == errno.EFBIG and str(error.value.filename).endswith("arrays.safetensors")
+    assert same(checkpoint.restore(folder)[0], make_arrays(20))
 
 
 def cut(path: Path, share: float) -> None:
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-
-
-def largest(folder: Path) -> Path:
-    return max((path for path in folder.rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
 
 
 def emptied(folder: Path) -> None:
@@ -191,15 +231,11 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
     "another digit in meta.json": lambda path: (path / "meta.json").write_text(
         (path / "meta.json").read_text().replace('"frames": 20', '"frames": 21')
     ),
-    "no arrays": lambda path: shutil.rmtree(path / "arrays"),
-    "nothing in arrays": lambda path: emptied(path / "arrays"),
-    "the arrays of another": lambda path: (
-        shutil.rmtree(path / "arrays"),
-        shutil.copytree(path.parent / "10" / "arrays", path / "arrays"),
-    ),
-    "half of the data": lambda path: [cut(file, 0.5) for file in (path / "arrays" / "d").iterdir()],
-    "no data": lambda path: shutil.rmtree(path / "arrays" / "d"),
-    "no _METADATA": lambda path: (path / "arrays" / "_METADATA").unlink(),
+    "no arrays": lambda path: (path / "arrays.safetensors").unlink(),
+    "nothing in arrays": lambda path: cut(path / "arrays.safetensors", 0),
+    "the arrays of another": lambda path: shutil.copy(path.parent / "10" / "arrays.safetensors", path / "arrays.safetensors"),
+    "half of the arrays": lambda path: cut(path / "arrays.safetensors", 0.5),
+    "a folder named arrays": lambda path: (path / "arrays").mkdir(),
     "nothing at all": emptied,
     "a file in its place": lambda path: (shutil.rmtree(path), path.write_text("x")),
 }

@@ -250,6 +250,49 @@ def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
         assert free
 
 
+# --- No room ---
+
+
+def limited(size: int, words: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process that may make no file larger than so many bytes."""
+    code = "import resource, sys; from pcil import cli\n"
+    code += f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); sys.exit(cli.main(sys.argv[1:]))"
+    return subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, env={**os.environ, **environment}, timeout=300
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no limit on the size of a file")
+def test_whatever_can_not_be_written_any_more_is_one_sentence_and_nothing_is_lost(tmp_path: Path) -> None:
+    """From the first file to the checkpoint, the curve, a recording and a report; without a limit each then ends well."""
+    train = "train toy/point_mass-v0 --method expert --frames 200 --seed-frames 100 --random-frames 100 --evaluate-every 100"
+    train += " --evaluate-episodes 2 --agent.hidden 16 --agent.batch-size 32 --agent.feature-dim 8 --checkpoint-seconds 0"
+    commands = {
+        f"{train} --out run": (0, 1000, 4000, 20_000),
+        "record run --episodes 2 --out data": (0, 30_000),
+        "report run --out page": (0, 1000, 100_000),
+    }
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}  # which can't be written either
+    for command, sizes in commands.items():
+        for size in sizes:
+            done = limited(size, command.split(), **cache)
+            assert done.returncode == 2, (command, size, done.stderr)
+            assert done.stderr.startswith("pcil: ") and done.stderr.count("\n") == 1, (command, size, done.stderr)
+        done = limited(2**40, command.split(), **cache)
+        assert (done.returncode, done.stderr) == (0, ""), (command, done.stderr)
+    assert limited(2**40, f"{train} --out alone".split(), **cache).returncode == 0
+    for name in ("policy/policy.safetensors", "policy/policy.json", "DONE"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "alone" / name).read_bytes()
+
+
+def test_a_run_that_is_refused_for_its_size_leaves_its_folder_free(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = "train toy/point_mass-v0 --method expert --frames 200 --replay-steps 100000000000 --out run"
+    assert cli.main(words.split()) == 2
+    assert capsys.readouterr().err.startswith("pcil: The run in run stopped: there is not enough memory")
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
 # --- Text that is shown ---
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints between episodes: arrays by Orbax, counters by JSON, a checksum of every file; the two newest are kept."""
+"""Checkpoints between episodes: arrays in safetensors, counters in JSON, a checksum of each; the two newest are kept."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import jax
 import numpy as np
 
 from pcil import files
+from pcil.errors import InputError
 
 KEEP = 2
+ARRAYS = "arrays.safetensors"
 Arrays = dict[str, np.ndarray]
 
 
@@ -23,16 +25,14 @@ def save(folder: Path, frames: int, arrays: Arrays, counters: dict[str, Any]) ->
 
     Older ones than the last two go, and so do those after `frames`: `restore` passed over them, for they were damaged.
     """
-    import orbax.checkpoint as ocp
-
     final, partial = folder / str(frames), folder / f"partial-{frames}"
     for leftover in folder.glob("partial-*"):
         shutil.rmtree(leftover)
     partial.mkdir(parents=True)
-    ocp.PyTreeCheckpointer().save((partial / "arrays").absolute(), arrays)
-    text = json.dumps({"counters": counters, "files": _checksums(partial / "arrays")})
+    files.save_arrays(partial / ARRAYS, arrays)
+    text = json.dumps({"counters": counters, "files": _checksums(partial)})
     (partial / "meta.json").write_text(f"{zlib.crc32(text.encode())}\n{text}\n")
-    for path in (*partial.rglob("*"), partial):
+    for path in (*partial.iterdir(), partial):
         files.sync(path)
     shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
@@ -49,7 +49,9 @@ def restore(folder: Path) -> tuple[Arrays | None, dict[str, Any], list[str]]:
     for path in _newest_first(folder):
         try:
             arrays, counters = _read(path)
-        except Exception as error:  # whatever a torn file makes Orbax raise, the next older checkpoint is the answer
+        except InputError:
+            raise
+        except Exception as error:  # whatever a torn file makes a library raise, the next older checkpoint is the answer
             complaints.append(f"The checkpoint {path} is damaged ({_first_line(error)}) and is passed over.")
         else:
             return arrays, counters, complaints
@@ -79,28 +81,39 @@ def unflatten(name: str, like: Any, arrays: Arrays) -> Any:
 
 
 def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
-    import orbax.checkpoint as ocp
+    from safetensors.numpy import load_file
 
     crc, text = (path / "meta.json").read_text().splitlines()
     if zlib.crc32(text.encode()) != int(crc):
         raise ValueError("the checksum of meta.json is wrong")
-    meta = json.loads(text)
-    found = _checksums(path / "arrays")
+    meta, orbax = json.loads(text), path / "arrays"
+    found = _checksums(orbax if orbax.is_dir() else path)
     for name, expected in meta["files"].items():
         if found.get(name) != expected:
             raise ValueError(f"{name} is {'missing' if name not in found else 'not what was written'}")
-    arrays = ocp.PyTreeCheckpointer().restore((path / "arrays").absolute())
-    return {name: np.asarray(array) for name, array in arrays.items()}, meta["counters"]
+    return _read_orbax(orbax) if orbax.is_dir() else load_file(path / ARRAYS), meta["counters"]
+
+
+def _read_orbax(folder: Path) -> Arrays:
+    """The arrays of a checkpoint of before version 0.2, which Orbax wrote."""
+    try:
+        import orbax.checkpoint as ocp
+    except ImportError as error:
+        raise InputError(
+            f"{folder} is of an older version and needs Orbax; pip install orbax-checkpoint, and give the same command again."
+        ) from error
+    arrays = ocp.PyTreeCheckpointer().restore(folder.absolute())
+    return {name: np.asarray(array) for name, array in arrays.items()}
 
 
 def _newest_first(folder: Path) -> list[Path]:
     return sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name), reverse=True)
 
 
-def _checksums(arrays: Path) -> dict[str, int]:
-    """CRC-32 of each file that Orbax wrote, so that damage is known before Orbax reads it."""
-    files = sorted(path for path in arrays.rglob("*") if path.is_file())
-    return {str(path.relative_to(arrays)): zlib.crc32(path.read_bytes()) for path in files}
+def _checksums(folder: Path) -> dict[str, int]:
+    """CRC-32 of each file of arrays, so that damage is known before a library reads it."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "meta.json")
+    return {str(path.relative_to(folder)): zlib.crc32(path.read_bytes()) for path in paths}
 
 
 def _first_line(error: Exception) -> str:

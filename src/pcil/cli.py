@@ -93,12 +93,15 @@ def _run(run: "Run", out: Path) -> int:
 
 
 def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
+    from pcil import files
+
     try:
         from pcil.report import figures
     except ImportError:
         bar.say("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
     else:
-        bar.say(f"Learning curve: {figures.run_curve(out, expert)}")
+        with files.room_for(f"Drawing {out / 'curve.png'}"):
+            bar.say(f"Learning curve: {figures.run_curve(out, expert)}")
 
 
 def _shipped_return(task: str) -> float | None:

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float
 
-from pcil import envs, seeds
+from pcil import envs, files, seeds
 from pcil.arrays import episodes_of
 from pcil.errors import InputError
 from pcil.minari_files import Stored, read, reason, task_of, write
@@ -155,6 +155,8 @@ class Demonstrations:
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
                 unfinished = Path(scratch) / "dataset"
+                size = sum(e.obs.nbytes + e.action.nbytes + e.reward.nbytes for e in self.episodes)
+                files.reserve(Path(scratch), 2 * size + 2**16 * len(self.episodes) + 2**20)  # HDF5 dies on a full disk
                 kept = (getattr(self, name) for name in Stored._fields)
                 write(unfinished / "data", dataset_id, Stored(*kept))
                 unfinished.rename(folder)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import re
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,11 @@ from pcil.errors import InputError
 
 LARGEST = 16 * 2**20
 """Bytes of a file that is read whole."""
+NO_ROOM = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota on the disk is used up",
+    errno.EFBIG: "a file would be larger than the system allows (ulimit -f)",
+}
 DIGITS = 300
 """Of a whole number in JSON; a float holds no more."""
 
@@ -75,6 +83,43 @@ def write_text(path: Path, text: str) -> None:
         file.flush()
         os.fsync(file.fileno())
     partial.replace(path)
+
+
+@contextlib.contextmanager
+def room_for(what: str) -> Iterator[None]:
+    """Turn what a full disk or memory raises into an `InputError` that begins with the name of what did not fit."""
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError(f"{what} stopped: there is not enough memory ({error}); make --replay-steps smaller.") from error
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise InputError(
+            f"{what} stopped: {NO_ROOM[error.errno]}; what was saved is whole: free some space and give the same command again."
+        ) from error
+
+
+def reserve(folder: Path, size: int) -> None:
+    """Raise `OSError` where a folder has no room for so many bytes, for libraries that die where a write fails."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        while size > 0:
+            size -= file.write(bytes(min(size, 2**20)))
+            file.flush()
+
+
+def save_arrays(path: Path, arrays: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
+    """Write a safetensors file; `OSError` where the disk does not take it."""
+    import numpy as np
+    from safetensors import SafetensorError
+    from safetensors.numpy import save_file
+
+    try:
+        save_file({name: np.asarray(array, order="C") for name, array in arrays.items()}, path, metadata)
+    except SafetensorError as error:
+        if not (code := re.search(r"(?:os error|code:) (\d+)", str(error))):
+            raise
+        raise OSError(int(code[1]), os.strerror(int(code[1])), str(path)) from error
 
 
 def sync(path: Path) -> None:

@@ -52,12 +52,10 @@ class Policy:
     def save(self, folder: Path) -> None:
         """Write `policy.safetensors`, which holds its own checksum, and `policy.json` into `folder`, each by a rename, so
         neither is ever half written."""
-        from safetensors.numpy import save_file
-
         folder.mkdir(parents=True, exist_ok=True)
-        arrays = {name: np.ascontiguousarray(array) for name, array in _named(self.actor).items()}
+        arrays = _named(self.actor)
         text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
-        save_file(arrays, folder / "policy.safetensors.tmp", {"sha256": _digest(arrays)})
+        files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": _digest(arrays)})
         (folder / "policy.json.tmp").write_text(text + "\n")
         for name in ("policy.safetensors", "policy.json"):
             (folder / f"{name}.tmp").replace(folder / name)

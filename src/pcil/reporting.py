@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from pcil.errors import InputError, shown
-from pcil.files import expanded
+from pcil.files import expanded, room_for
 
 
 def report(
@@ -29,14 +29,15 @@ def report(
     except ImportError as error:
         raise InputError(f"A report needs {error.name}, which pip install '.[report]' in a clone brings.") from error
     found = load.collect([expanded(path) for path in paths], _with_defaults)
-    page.clear(out := expanded(out))
-    films: dict[str, bytes] = {}
-    if rollouts and found.sources:
-        from pcil import film, representation
+    with room_for(f"The report in {out}"):
+        page.clear(out := expanded(out))
+        films: dict[str, bytes] = {}
+        if rollouts and found.sources:
+            from pcil import film, representation
 
-        representation.add(found)
-        films = film.films(found)
-    print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
+            representation.add(found)
+            films = film.films(found)
+        print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
     return 0
 
 

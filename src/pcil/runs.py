@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import platform
@@ -127,7 +126,7 @@ def execute(
     compilation.use_cache()
     folder = files.expanded(folder)
     run, demos, why = prepared(run, reporter.say, task=task, given=demos)
-    with _claimed(folder), _no_room_is_input_error(folder), _withdrawn_if_refused(folder):
+    with _claimed(folder), files.room_for(f"The run in {folder}"), _withdrawn_if_refused(folder):
         _describe(folder, run, demos, reporter)
         if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder))):
             reporter.say(why_not)
@@ -330,19 +329,3 @@ def _withdrawn_if_refused(folder: Path) -> Iterator[None]:
         if not before and not (folder / LOGS[0]).exists():
             (folder / "run.json").unlink(missing_ok=True)
         raise
-
-
-@contextlib.contextmanager
-def _no_room_is_input_error(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except MemoryError as error:
-        raise InputError(f"There is not enough memory ({error}); make --replay-steps smaller.") from error
-    except (OSError, ValueError) as error:
-        full = getattr(error, "errno", None) == errno.ENOSPC or "No space left on device" in str(error)
-        if not full:
-            raise
-        raise InputError(
-            f"The disk is full, so the run in {folder} stopped; what it saved is whole: free some space and give the same "
-            "command again."
-        ) from error

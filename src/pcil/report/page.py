@@ -22,12 +22,14 @@ def clear(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         old = out / "index.html"
-        if any(out.iterdir()) and not (old.is_file() and TITLE in old.read_text(errors="replace")[:1000]):
+        text = old.read_text(errors="replace")[:1000] if old.is_file() else None
+        if any(out.iterdir()) and (text is None or (text and TITLE not in text)):  # a full disk leaves an empty one
             raise InputError(f"{out} holds something else than a report; give --out a new or empty folder.")
         for folder, kinds in (("figures", (".png", ".pdf")), ("tables", (".csv", ".md"))):
             for file in (out / folder).glob("*"):
                 if file.suffix in kinds:
                     file.unlink()
+        old.write_text(f"<!doctype html>{TITLE}</title>This report is not finished.")  # known as ours, should this one stop
     except OSError as error:
         raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
 

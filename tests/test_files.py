@@ -271,7 +271,7 @@ def test_whatever_can_not_be_written_any_more_is_one_sentence_and_nothing_is_los
     commands = {
         f"{train} --out run": (0, 1000, 4000, 20_000),
         "record run --episodes 2 --out data": (0, 30_000),
-        "report run --out page": (0, 1000, 100_000),
+        "report run --out page": (0, 1000, 10_000),
     }
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}  # which can't be written either
     for command, sizes in commands.items():

@@ -4,7 +4,8 @@ BIN := .venv/bin
 STAMP := .venv/.ready
 
 # make mutants FILES="losses noise" N=200: which changes of the source no test notices (docs/mutants.md)
-.PHONY: setup train test test-slow mutants check bench docs format clean
+# make fuzz N=2000, make kills N=100: inputs that are changed at random, runs that are killed and damaged (docs/reliability.md)
+.PHONY: setup train test test-slow mutants fuzz kills check bench docs format clean
 
 setup: $(STAMP)
 
@@ -25,6 +26,12 @@ test-slow: $(STAMP)
 
 mutants: $(STAMP)
 	$(BIN)/python tests/mutants.py $(FILES) $(if $(N),--number $(N))
+
+fuzz: $(STAMP)
+	$(BIN)/python tests/fuzz.py $(KINDS) $(if $(N),--number $(N)) $(if $(SEED),--seed $(SEED))
+
+kills: $(STAMP)
+	$(BIN)/python tests/kills.py $(METHODS) $(if $(N),--number $(N)) $(if $(SEED),--seed $(SEED))
 
 check: $(STAMP)
 	$(BIN)/ruff check .

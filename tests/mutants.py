@@ -98,7 +98,9 @@ def mutants(name: str, text: str) -> list[Mutant]:
         operator = get_operator(operator_name)()
         positions = Positions(operator)
         positions.walk(get_ast(text))
-        wanted = [i for i, start in enumerate(positions.found) if tuple(start) not in typed]
+        wanted = [
+            i for i, (n, c) in enumerate(positions.found) if (n, c) not in typed and not lines[n - 1][c:].startswith("*,")
+        ]
         codes += [mutate_code(text, operator, i) or text for i in wanted]
     offsets = [0, *(len(line) + 1 for line in lines)]
     begin = lambda n, c: sum(offsets[:n]) + c  # noqa: E731

@@ -7,9 +7,12 @@ import math
 from math import inf
 from typing import Any
 
+import jax.numpy as jnp
 import pytest
 
+from pcil import presets
 from pcil.agents import BC, DrQV2
+from pcil.agents.base import Agent
 from pcil.errors import InputError
 from pcil.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN
@@ -55,3 +58,21 @@ def test_numbers_are_taken_up_to_their_limits_and_no_further(settings: Any, name
             dataclasses.replace(settings, **{name: kind(limit)})
             with pytest.raises(InputError, match=rf"\.{name} is .* it must be"):
                 dataclasses.replace(settings, **{name: kind(outside)})
+
+
+@pytest.mark.parametrize("settings", [DrQV2(), BC(), PCIL()])
+def test_true_is_no_whole_number(settings: Any) -> None:
+    """Python has it as 1. What is of no kind of number never gets so far: the hook of the tests refuses it."""
+    with pytest.raises(InputError, match=r"\.batch_size is True; it must be a whole number"):
+        dataclasses.replace(settings, batch_size=True)
+
+
+def test_only_bc_learns_offline_and_only_the_tasks_reward_asks_for_no_demonstrations() -> None:
+    made = {method: presets.make("walker_walk", method) for method in presets.METHODS}
+    assert [method for method, run in made.items() if run.agent.offline] == ["bc"]
+    assert [method for method, run in made.items() if not run.reward.needs_demos] == ["bc", "expert"]
+
+
+def test_an_agent_without_statistics_of_observations_keeps_its_state() -> None:
+    state = object()
+    assert Agent.observe(DrQV2(), state, jnp.zeros((3, 2))) is state

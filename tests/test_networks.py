@@ -231,6 +231,12 @@ def test_without_correlation_the_noise_is_the_generators_own() -> None:
         np.testing.assert_array_equal(next(walk), rng.standard_normal(2, dtype=np.float32))
 
 
+def test_a_schedule_of_one_step_is_at_its_end_after_it() -> None:
+    for steps, expected in ((1, [1.0, 0.1, 0.1]), (2, [1.0, 0.55, 0.1])):
+        schedule = LinearSchedule(1.0, 0.1, steps)
+        assert [float(schedule(step, np)) for step in range(3)] == pytest.approx(expected)
+
+
 def test_the_schedule_never_turns_back() -> None:
     values = [float(LinearSchedule(1.0, 0.1, 100)(step, np)) for step in range(120)]
     assert np.all(np.diff(values) <= 0) and values[0] == 1 and len(set(values)) == 101

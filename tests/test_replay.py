@@ -244,6 +244,12 @@ def test_a_replay_of_episodes_holds_them_all_with_their_own_rewards_and_no_row_m
         assert set(drawn) == set(windows) and replay.num_windows(n) == len(windows)
 
 
+def test_a_replay_may_be_of_a_single_episode() -> None:
+    episode = make_episode(0, 5, True)
+    replay = Replay.of([episode])
+    assert (replay.capacity, replay.num_episodes, replay.num_windows(1)) == (6, 1, 5)
+
+
 def test_an_empty_replay_has_no_window() -> None:
     replay = Replay(10, 2, 1)
     assert (replay.num_windows(1), replay.num_steps, replay.num_episodes) == (0, 0, 0)

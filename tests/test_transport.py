@@ -91,6 +91,11 @@ def test_padding_gets_no_mass_and_changes_nothing() -> None:
     assert not plan.any()
 
 
+def test_weights_are_shares_whatever_their_sum() -> None:
+    cost, shares = random_cost(4, 6, 0), np.arange(1.0, 7.0)
+    np.testing.assert_allclose(plan_of(cost, 0.1, 500, 3 * shares), plan_of(cost, 0.1, 500, shares / 21), atol=1e-7)
+
+
 def test_many_at_once_are_one_by_one() -> None:
     costs, weights = np.stack([random_cost(8, 6, seed) for seed in range(4)]), (jnp.full(8, 1 / 8), jnp.full((4, 6), 1 / 6))
     together = jax.vmap(lambda c, w: sinkhorn_plan(c, weights[0], w, 0.01, 100))(jnp.asarray(costs), weights[1])

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
-    "errors types seeds files compilation",
+    "errors types seeds files modules compilation",
     "losses transport optimiser networks noise theory",
     "envs arrays minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop fit runs progress",

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import compilation, envs, learner, loop, presets, runs, seeds
+from pcil import compilation, envs, learner, loop, modules, presets, runs, seeds
 from pcil.config import Run
 from pcil.errors import InputError
 from pcil.report.embedding import project
@@ -23,8 +23,11 @@ EXPERT_STEPS, AGENT_STEPS = 128, 256
 _NEVER = 2**62
 
 
-def add(found: Collection) -> None:
-    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not."""
+def add(found: Collection, trust: Sequence[str] = ()) -> None:
+    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not.
+
+    `trust` are the modules that the runs' files may name.
+    """
     try:
         compilation.use_cache()
     except InputError as error:
@@ -34,7 +37,7 @@ def add(found: Collection) -> None:
     for name, source in found.sources.items():
         last = [point for point in found.points if point[:4] == name][-1]
         try:
-            found.dots.extend(transitions(source, last))
+            found.dots.extend(transitions(source, last, trust))
         except (InputError, ImportError) as error:
             refused.append(error)
     found.dots.sort(key=place)
@@ -42,7 +45,7 @@ def add(found: Collection) -> None:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
 
 
-def transitions(source: Source, row: Point) -> list[Dot]:
+def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[Dot]:
     """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
 
     Empty where the run's reward has no representation; `InputError` where it can't be restored.
@@ -50,6 +53,7 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     run = restored(source.settings)
     if type(run.reward).representation is Reward.representation:
         return []
+    modules.admit(f"The run in {source.folder}", modules.of_task(run.task, run.env_kwargs), trust)
     demos = runs.demonstrations(run)
     assert demos is not None
     with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:

@@ -24,7 +24,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
     "errors types seeds files modules compilation",
-    "losses transport optimiser networks noise theory",
+    "losses transport optimiser networks noise theory hdf5",
     "envs arrays minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner loop fit runs progress",
     "representation film reporting",

@@ -1,13 +1,19 @@
 """Numbers out of HDF5 files that anybody may have written: what a file says of its arrays is checked before they are read.
 
 The HDF5 library follows a file to other files, to code and out of memory. So here nothing but plain arrays in the file itself
-can be named, and only as many numbers are read as `NUMBERS`.
+can be named, and only as many numbers are read as `NUMBERS`. What the library does not see, such as an index that leads back to
+itself, ends the process or never ends; so a file is read in a process of its own, which is this module as a script.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
+import json
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -32,8 +38,109 @@ PACKED = 2**21
 """Bytes of a packed chunk, which may unfold to `RATIO` times as many before its size is known to be wrong."""
 HEADER = 2**16
 """Bytes of what describes an array or a group; types can be nested in it."""
+MEMORY = 2**34
+"""Bytes of address space of the process that reads."""
+PATIENCE_SECONDS, BYTES_A_SECOND = 30.0, 5e6
+"""How long a file may take, and how much longer for its size."""
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_LZF, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 """What arrays may be packed with; the library looks for the code of others in folders of the machine."""
+
+
+Parts = dict[str, list[Any]]
+"""The arrays of an episode: for each of its parts those of the Boxes that it is made of."""
+
+
+class Damage(ValueError):
+    """What is wrong with a file, and in which episode, if in one."""
+
+    def __init__(self, text: str, episode: int | None) -> None:
+        super().__init__(text)
+        self.episode = episode
+
+
+def read(path: Path, wanted: dict[str, Any]) -> list[tuple[int | None, Parts]]:
+    """`episodes`, read in another process; `Damage` too where that crashes or does not end."""
+    seconds = PATIENCE_SECONDS + (path.stat().st_size if path.exists() else 0) / BYTES_A_SECOND
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-P", __file__, str(path)]
+    try:
+        asked = {"input": json.dumps(wanted).encode(), "timeout": seconds, "env": environment}
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True, **asked)
+    except subprocess.TimeoutExpired:
+        raise Damage(f"reading it did not end within {seconds:.0f} s", None) from None
+    except subprocess.CalledProcessError as error:
+        raise Damage(f"the HDF5 library can't read it (exit code {error.returncode})", None) from None
+    answer, found = io.BytesIO(done.stdout), []
+    while line := answer.readline():
+        about = json.loads(line)
+        if "error" in about:
+            raise Damage(about["error"], about["episode"])
+        numbers = {key: [np.lib.format.read_array(answer) for _ in range(count)] for key, count in about["parts"].items()}
+        found.append((about["seed"], numbers))
+    return found
+
+
+def main() -> None:
+    """Answer to `read`: the path is the argument, what is wanted comes in, and episodes or what is wrong go out."""
+    with contextlib.suppress(ImportError, ValueError, OSError):  # not every system has such a limit
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard), hard))
+    out = sys.stdout.buffer
+    try:
+        for seed, parts in episodes(Path(sys.argv[1]), json.load(sys.stdin)):
+            about = {"seed": seed, "parts": {key: len(arrays) for key, arrays in parts.items()}}
+            out.write(json.dumps(about).encode() + b"\n")
+            for array in (array for arrays in parts.values() for array in arrays):
+                np.lib.format.write_array(out, array)
+    except Damage as error:
+        out.write(json.dumps({"error": str(error), "episode": error.episode}).encode() + b"\n")
+
+
+def episodes(path: Path, wanted: dict[str, Any]) -> Iterator[tuple[int | None, Parts]]:
+    """The seed and the arrays of each episode of a Minari file; `Damage` where it is not as it must be.
+
+    `wanted` says how many "episodes" and "steps" there are in all, and of each part of an episode the "boxes", with path and
+    shape of a row. Actions and rewards may be in no episode at all.
+    """
+    index = None
+    try:
+        with opened(path) as file:
+            count, groups, located = wanted["episodes"], [], []
+            if len(file) != count:
+                raise ValueError(f"{path.name} has {len(file)} episodes, metadata.json says {count}")
+            for index in range(count):
+                groups.append(member(file, f"episode_{index}"))
+            absent = {key for key in ("actions", "rewards") if not any(has(group, key) for group in groups)}
+            boxes = {key: value for key, value in wanted["boxes"].items() if key not in absent}
+            for index in range(count):
+                located.append(_located(groups[index], boxes))
+            index, steps = None, sum(len(parts["terminations"][0]) for parts in located)
+            if steps != wanted["steps"]:
+                raise ValueError(f"there are {steps} steps in all, metadata.json says {wanted['steps']}")
+            check_size((array for parts in located for arrays in parts.values() for array in arrays), path)
+            for index in range(count):
+                numbers = {key: [array[()] for array in arrays] for key, arrays in located[index].items()}
+                yield integer(groups[index], "seed"), numbers
+    except Exception as error:  # h5py raises anything on what is damaged
+        raise Damage(str(error) or type(error).__name__, index) from error
+
+
+def _located(group: h5py.Group, boxes: dict[str, Any]) -> Parts:
+    """The arrays of an episode, not read yet; each has the rows that it must have, or `ValueError`."""
+    if boxes.get("actions", ()) is None:
+        raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
+    parts = {key: [array(group, path, shape) for path, shape in inner] for key, inner in boxes.items()}
+    lengths = {key: {len(array) for array in arrays} or {0} for key, arrays in parts.items()}
+    steps = max(lengths["terminations"])
+    if not steps or any(length != {steps + (key == "observations")} for key, length in lengths.items()):
+        told = {key: " or ".join(map(str, sorted(length))) for key, length in lengths.items()}
+        told = {"actions": "no", "rewards": "no"} | told
+        given = "{actions} actions with {observations} observations, {rewards} rewards, {terminations} terminations and "
+        given = (given + "{truncations} truncations").format_map(told)
+        raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {given}")
+    return parts
 
 
 @contextlib.contextmanager
@@ -54,11 +161,11 @@ def has(group: Any, name: str) -> bool:
 
 
 def member(group: h5py.Group, path: str) -> Any:
-    """A group or an array in the same file, named without links; `KeyError` or `ValueError` where there is none."""
+    """A group or an array in the same file, named without links; `ValueError` where there is none."""
     found: Any = group
     for name in path.split("/"):
         if not has(found, name):
-            raise KeyError(path)
+            raise ValueError(f"there is no {path!r}")
         if found.id.links.get_info(name.encode()).type != h5l.TYPE_HARD:
             raise ValueError(f"{path} is a link to another place")
         if h5o.get_info(found.id, name.encode()).hdr.space.total > HEADER:
@@ -118,3 +225,7 @@ def integer(group: h5py.Group, name: str) -> int | None:
     value = np.zeros(found.shape, np.int64)
     found.read(value)
     return int(value.item())
+
+
+if __name__ == "__main__":
+    main()

@@ -36,8 +36,8 @@ class Stored(NamedTuple):
     """`pcil.demos:Demonstrations.hash` when it was saved; None where that is unknown."""
 
 
-def read(data: Path) -> Stored:
-    """A dataset whose data are HDF5.
+def read(data: Path, *, trusted: bool = False) -> Stored:
+    """A dataset whose data are HDF5, read in a process of its own where it is not `trusted`.
 
     Actions or rewards are absent where no episode has any: the file lacks them, or all of them are NaN. Minari's own reader is
     not used: it follows a damaged or foreign file to other files, into crashes, and to whatever environment the file names.
@@ -57,52 +57,25 @@ def read(data: Path) -> Stored:
             raise ValueError("its task is no name or its info no table")
         if metadata["data_format"] != "hdf5":
             raise ValueError(f"its data_format is {metadata['data_format']!r:.80}, and only hdf5 is read")
-        with hdf5.opened(path := data / "main_data.hdf5") as file:
-            if len(file) != len(indices):
-                raise ValueError(f"{path.name} has {len(file)} episodes, metadata.json says {len(indices)}")
-            groups, located = [], []
-            for index in indices:
-                where = f"Episode {index} of {data}"
-                groups.append(hdf5.member(file, f"episode_{index}"))
-            absent = {key for key in ("actions", "rewards") if not any(hdf5.has(group, key) for group in groups)}
-            for index, group in enumerate(groups):
-                where = f"Episode {index} of {data}"
-                located.append(_located(group, absent, *spaces))
-            where, found = str(data), sum(len(arrays["terminations"][0]) for arrays in located)
-            if found != steps:
-                raise ValueError(f"there are {found} steps in all, metadata.json says {steps}")
-            hdf5.check_size((array for arrays in located for part in arrays.values() for array in part), path)
-            for index, (group, arrays) in enumerate(zip(groups, located, strict=True)):
-                where = f"Episode {index} of {data}"
-                episodes.append(_episode(arrays, hdf5.integer(group, "seed"), spaces[1]))
+        boxes: dict[str, Any] = {
+            key: list(_boxes(key, space)) for key, space in zip(PARTS, (spaces[0], *[SCALAR] * 4), strict=True)
+        }
+        boxes["actions"] = list(_boxes("actions", spaces[1])) if spaces[1]["type"] == "Box" else None
+        wanted = {"episodes": len(indices), "steps": steps, "boxes": boxes}
+        for seed, arrays in (hdf5.episodes if trusted else hdf5.read)(data / "main_data.hdf5", wanted):
+            where = f"Episode {len(episodes)} of {data}"
+            episodes.append(_episode(arrays, seed, spaces[1]))
         where = str(data)
         has_actions = any(episode.action.shape[1] for episode in episodes)
         has_rewards = not all(np.isnan(episode.reward).all() for episode in episodes)
         if not has_rewards:
             episodes = [dataclasses.replace(episode, reward=np.zeros(len(episode))) for episode in episodes]
         origin = _checked(Origin(**own["origin"]) if "origin" in own else _origin(metadata, spaces[1]))
-    except Exception as error:  # a damaged file may make json, h5py and Minari raise anything
+    except Exception as error:  # damaged JSON may make anything raise anything
+        if isinstance(error, hdf5.Damage):
+            where = str(data) if error.episode is None else f"Episode {error.episode} of {data}"
         raise InputError(f"{where} is not as Minari writes it and can not be read: {reason(error)}.") from error
     return Stored(own["task"], tuple(episodes), own["info"], origin, has_actions, has_rewards, own.get("hash"))
-
-
-def _located(group: Any, absent: set[str], observation_space: dict, action_space: dict) -> dict[str, list[Any]]:
-    """The arrays of an episode, not read yet, by its parts; each has the rows that it must have, or `ValueError`."""
-    from pcil import hdf5
-
-    if "actions" not in absent and action_space["type"] != "Box":
-        raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
-    spaces = zip(PARTS, (observation_space, action_space, SCALAR, SCALAR, SCALAR), strict=True)
-    wanted = {key: _boxes(key, space) for key, space in spaces if key not in absent}
-    arrays = {key: [hdf5.array(group, path, shape) for path, shape in boxes] for key, boxes in wanted.items()}
-    lengths = {key: {len(array) for array in parts} or {0} for key, parts in arrays.items()}
-    steps = max(lengths["terminations"])
-    if not steps or any(length != {steps + (key == "observations")} for key, length in lengths.items()):
-        told = {key: " or ".join(map(str, sorted(lengths.get(key, {"no"})))) for key in PARTS}
-        given = "{actions} actions with {observations} observations, {rewards} rewards, {terminations} terminations and "
-        given = (given + "{truncations} truncations").format_map(told)
-        raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {given}")
-    return arrays
 
 
 def _boxes(path: str, space: dict[str, Any]) -> Iterator[tuple[str, list[int]]]:
@@ -139,13 +112,13 @@ def _checked(origin: Origin) -> Origin:
 
 
 def _episode(arrays: dict[str, list[Any]], seed: int | None, action_space: dict) -> Episode:
-    """One episode out of its `_located` arrays; the action space is the metadata's, in JSON. `ValueError` if ill-formed."""
-    parts = [array[()].reshape(len(array), -1) for array in arrays["observations"] if 0 not in array.shape]
+    """One episode out of its arrays; the action space is the metadata's, in JSON. `ValueError` if ill-formed."""
+    parts = [array.reshape(len(array), -1) for array in arrays["observations"] if 0 not in array.shape]
     if not parts:
         raise ValueError("its observations are rows of no numbers")
-    ends = arrays["terminations"][0][()]
-    action = _unit_actions(arrays["actions"][0][()], action_space) if "actions" in arrays else np.zeros((len(ends), 0))
-    reward = arrays["rewards"][0][()] if "rewards" in arrays else np.full(len(ends), np.nan)
+    ends = arrays["terminations"][0]
+    action = _unit_actions(arrays["actions"][0], action_space) if "actions" in arrays else np.zeros((len(ends), 0))
+    reward = arrays["rewards"][0] if "rewards" in arrays else np.full(len(ends), np.nan)
     reward = reward.astype("f4" if reward.dtype == np.float32 else "f8")
     with np.errstate(over="ignore"):  # what is too large becomes infinite here, and is refused as such
         obs = np.concatenate([part.astype(np.float32) for part in parts], axis=1)

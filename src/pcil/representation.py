@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,6 +21,8 @@ from pcil.types import Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
 """As many transitions as the paper's Figure 4 has."""
+NUMBERS = 2**28
+"""At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
 _NEVER = 2**62
 
 
@@ -38,7 +41,7 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         last = [point for point in found.points if point[:4] == name][-1]
         try:
             found.dots.extend(transitions(source, last, trust))
-        except (InputError, ImportError) as error:
+        except Exception as error:  # a run's files may hold anything
             refused.append(error)
     found.dots.sort(key=place)
     if refused:
@@ -57,6 +60,11 @@ def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[D
     demos = runs.demonstrations(run)
     assert demos is not None
     with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:
+        fresh = jax.eval_shape(lambda: loop.start(run, envs.spec(env), demos.episodes).learner)
+        if (numbers := sum(leaf.size for leaf in jax.tree.leaves(fresh))) > NUMBERS:
+            raise InputError(
+                f"The run in {source.folder} has networks of {numbers:,} numbers; at most {NUMBERS:,} are restored."
+            )
         state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), runs.Silent())
         if not state.counters.episodes:
             raise InputError(f"{source.folder} holds no checkpoint that can be read.")

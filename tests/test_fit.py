@@ -26,7 +26,7 @@ from pcil.policy import load_policy
 from pcil.rewards import REWARDS
 from pcil.types import Episode, Origin
 from small import POINT_MASS, save_point_mass_demos, small_run
-from test_demos import edit_metadata, refusal
+from test_demos import edit_metadata, forget_checksum, refusal
 
 
 class Slider(gymnasium.Env):
@@ -196,6 +196,7 @@ def loud(folder: Path) -> str:
     path = Path(save(folder))
     with h5py.File(path / "data" / "main_data.hdf5", "a") as file:
         file["episode_0/actions"][1, 0] = -1.02
+    forget_checksum(path / "data")
     return str(path)
 
 
@@ -234,6 +235,7 @@ def stripped(folder: Path, *absent: str, how: str = "from_arrays") -> str:
                     group[key][...] = np.nan
                 else:
                     del group[key]
+    forget_checksum(folder / "whole" / "point_mass-v0" / "data")
     return str(folder / "whole" / "point_mass-v0")
 
 

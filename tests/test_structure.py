@@ -23,8 +23,8 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
-    "errors types seeds files compilation",
-    "losses transport optimiser networks noise theory",
+    "errors types seeds files modules compilation",
+    "losses transport optimiser networks noise theory hdf5",
     "envs arrays minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner state loop fit runs progress",
     "representation film reporting",

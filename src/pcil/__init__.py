@@ -7,10 +7,7 @@
 Names load on first use, so that `import pcil` and `pcil --help` stay fast.
 """
 
-from __future__ import annotations
-
 import importlib
-from typing import Any
 
 __version__ = "0.1.0"
 __all__ = [
@@ -40,7 +37,7 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str):
     if name not in _HOME:
         raise AttributeError(f"module 'pcil' has no attribute {name!r}")
     module, attribute = _HOME[name]

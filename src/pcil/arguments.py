@@ -6,7 +6,7 @@ import functools
 import importlib
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,17 +41,21 @@ def call(name: str, function: Callable[..., int], words: list[str]) -> int:
     return bound()
 
 
-def train(words: list[str], execute: Callable[["Run", Path], int]) -> int:
-    """Call `execute` with the run and the folder that the words of `pcil train` give."""
+def train(words: list[str], execute: Callable[["Run", Path], int], trust: Sequence[str] | None = None) -> int:
+    """Call `execute` with the run and the folder that the words of `pcil train` give.
+
+    Where a file gives the words, `trust` are the modules that it may name; where a person typed them, it is None.
+    """
     import tyro
 
-    from pcil import envs, presets
+    from pcil import envs, modules, presets
     from pcil.config import Run
 
     given = peek(words)
     task = envs.task_name(given.get("task", "walker_walk"))
     changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
     if "reward" in given:
+        modules.admit("--reward", [given["reward"].partition(":")[0]], trust)
         changes["reward"] = _load_reward(given["reward"])
         words = without(words, "reward")
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
@@ -69,6 +73,8 @@ def train(words: list[str], execute: Callable[["Run", Path], int]) -> int:
         Args:
             out: The run's folder; one that holds the same run resumes it.
         """
+        modules.admit("The task", modules.of_task(task), trust)
+        modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), trust)
         return execute(dataclasses.replace(run, task=task), out)
 
     return call("train", train, words)

@@ -41,11 +41,12 @@ def use_one_thread() -> None:
 def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
     use_one_thread()
-    from pcil import compilation, envs, presets
+    from pcil import compilation, envs, modules, presets
     from pcil.envs.timing import measure_env
 
     compilation.start()
     timing = measure_env(task)
+    modules.admit("The command", modules.of_task(task), None)
     imitation, alone = (presets.make(task, method, preset) for method in ("pcil", "expert"))
     with envs.opened(imitation.task) as env:
         spec = envs.spec(env)

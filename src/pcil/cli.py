@@ -21,8 +21,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 on bad input, 1 where a run failed, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
     # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if "" not in sys.path:
-        sys.path.insert(0, "")  # a module of one's own environment or reward may lie in the present folder
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = _command(words)
@@ -112,10 +110,10 @@ def _shipped_return(task: str) -> float | None:
 
 def _evaluate(words: list[str]) -> int:
     """Roll out the policy of a run, without exploration."""
-
     import tyro
 
     from pcil.config import EnvKwargs
+    from pcil.modules import Trust
 
     def evaluate(
         folder: Path,
@@ -124,6 +122,7 @@ def _evaluate(words: list[str]) -> int:
         seed: int = 0,
         env_kwargs: EnvKwargs | None = None,
         single_environment: bool = False,
+        trust: Trust = (),
         json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
     ) -> int:
         """Roll out the policy of a run, without exploration.
@@ -134,18 +133,18 @@ def _evaluate(words: list[str]) -> int:
             seed: The episodes' starts follow from it.
             env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
             single_environment: Play one episode after the other in one environment: slower, with the same results.
+            trust: Modules that the policy's files may name, whose code is then run, such as my.module.
             json_output: Print one JSON object and nothing else.
         """
-        from pcil.evaluate import environments_for
+        from pcil.evaluate import environments_for, playable
         from pcil.evaluate import evaluate as roll_out
-        from pcil.policy import load_policy
 
         _at_least(1, episodes=episodes)
         _at_least(0, seed=seed)
-        policy = load_policy(folder)
-        arguments = policy.env_kwargs if env_kwargs is None else env_kwargs
+        policy, arguments = playable(folder, env_kwargs, trust)
         copies = environments_for(policy.task, episodes, arguments, single=single_environment)
         with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
+            policy.check_fits(made[0])
             result = roll_out(policy, made, seed=seed, episodes=episodes)
         row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
         row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
@@ -181,8 +180,8 @@ def _demos(words: list[str]) -> int:
 
 def _record(words: list[str]) -> int:
     """Record demonstrations from a trained policy."""
-
     from pcil.config import EnvKwargs
+    from pcil.modules import Trust
 
     def record(
         folder: Path,
@@ -192,6 +191,7 @@ def _record(words: list[str]) -> int:
         seed: int = 0,
         minimum_return: float | None = None,
         env_kwargs: EnvKwargs | None = None,
+        trust: Trust = (),
     ) -> int:
         """Record demonstrations from a trained policy, as a Minari dataset.
 
@@ -202,20 +202,21 @@ def _record(words: list[str]) -> int:
             seed: The episodes' starts follow from it.
             minimum_return: Keep only episodes of at least this return.
             env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
+            trust: Modules that the policy's files may name, whose code is then run, such as my.module.
         """
-        from pcil import demos, envs
-        from pcil.policy import load_policy
-        from pcil.runs import provenance
+        from pcil import demos, envs, evaluate, runs
 
         _at_least(1, episodes=episodes)
         _at_least(0, seed=seed)
         demos.free_folder(out)
-        policy = load_policy(folder)
+        policy, arguments = evaluate.playable(folder, env_kwargs, trust)
         least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
         least += "" if env_kwargs is None else f" --env-kwargs '{json.dumps(env_kwargs)}'"
-        info = provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed}{least} --out {out}")
+        least += f" --trust {' '.join(trust)}" if trust else ""
+        info = runs.provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed}{least} --out {out}")
         asked: Any = {"task": policy.task, "seed": seed, "minimum_return": minimum_return, "info": info}
-        with envs.opened(policy.task, env_kwargs=policy.env_kwargs if env_kwargs is None else env_kwargs) as env:
+        with envs.opened(policy.task, env_kwargs=arguments) as env:
+            policy.check_fits(env)
             recorded = demos.record(policy, env, episodes, **asked)
         path = recorded.save(out)
         returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
@@ -268,8 +269,9 @@ def _report(words: list[str]) -> int:
 
 def _sweep(words: list[str]) -> int:
     """Train every run of a file, side by side."""
+    from pcil.modules import Trust
 
-    def sweep(file: Path, /, out: Path, jobs: int | None = None, address: str | None = None) -> int:
+    def sweep(file: Path, /, out: Path, jobs: int | None = None, address: str | None = None, trust: Trust = ()) -> int:
         """Train every run of a file, side by side; the same command skips what is done and resumes the rest.
 
         Exit code 1 says that a run failed; the others were finished all the same.
@@ -279,11 +281,12 @@ def _sweep(words: list[str]) -> int:
             out: Each run's folder is OUT/TASK/METHOD/SEED.
             jobs: Runs at the same time; by default as many as there are cores for.
             address: A Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine, and stopped at the end.
+            trust: Modules that the file may name as tasks or rewards, whose code is then run, such as my.module.
         """
         from pcil import files, progress, sweep
 
         _at_least(1, jobs=1 if jobs is None else jobs)
-        return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout))
+        return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout), trust)
 
     return arguments.call("sweep", sweep, words)
 

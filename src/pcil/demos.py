@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from pcil import envs, files, seeds
 from pcil.arrays import episodes_of
-from pcil.errors import InputError
+from pcil.errors import InputError, brief
 from pcil.minari_files import Stored, read, reason, task_of, write
 from pcil.types import Episode, Origin, Spec
 
@@ -69,13 +69,19 @@ class Demonstrations:
 
         `spec` is, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the path of a
         Minari dataset folder (or of the `data` folder in it), the id of a dataset in the user's local Minari root.
-        Dict observations are flattened as FlattenObservation does it, and actions are brought from the dataset's Box to
-        [-1, 1] as RescaleAction does it. All that Minari knows of a foreign dataset becomes its `info`. Actions out of
-        bounds are refused; with `bounded=False` they stay, for `clip`.
+        Dict observations are flattened as FlattenObservation does it, and actions brought from the dataset's Box to [-1, 1].
+        All that Minari knows of a foreign dataset becomes its `info`. Arrays without the checksum that `save` wrote are
+        refused, and actions out of bounds; with `bounded=False` these stay, for `clip`.
         """
         data = _find(spec)
-        loaded = cls(*read(data))
+        stored = read(data, trusted=data.is_relative_to(SHIPPED))
+        loaded = cls(*stored[:-1])
         _check(loaded, str(data), bounded=bounded)
+        if stored.hash not in (None, loaded.hash):
+            raise InputError(
+                f"{data} does not hold what was saved there: its checksum is {loaded.hash}, and metadata.json says "
+                f"{brief(stored.hash)} (pcil, hash); copy it again, or delete that key if you changed the arrays yourself."
+            )
         return loaded
 
     @property
@@ -161,9 +167,8 @@ class Demonstrations:
                 write(unfinished / "data", dataset_id, Stored(*kept))
                 unfinished.rename(folder)
         except (OSError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{folder} can not be written ({reason(error)}): the place must be writable, the info JSON."
-            ) from error
+            why = f"{folder} can not be written ({reason(error)}): the place must be writable, the info JSON."
+            raise InputError(why) from error
         return folder
 
     @property

@@ -6,13 +6,15 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from pcil import envs
+from pcil import envs, modules
 from pcil.errors import InputError
+from pcil.policy import Policy, load_policy
 from pcil.seeds import Stream, episode_seed
 
 LOCKSTEP = 32
@@ -34,6 +36,17 @@ class Evaluation:
     def mean(self) -> float:
         """Mean return."""
         return float(np.mean(self.returns))
+
+
+def playable(folder: Path, env_kwargs: dict[str, Any] | None, trust: Sequence[str]) -> tuple[Policy, dict[str, Any]]:
+    """The policy of a folder and its environment's keyword arguments, by default those it was trained with.
+
+    `InputError` where these files name a module that is not among those to `trust`.
+    """
+    policy = load_policy(folder)
+    modules.admit(f"The policy in {folder}", modules.of_task(policy.task, env_kwargs is None and policy.env_kwargs), trust)
+    modules.admit("--env-kwargs", modules.of_task("", env_kwargs), None)
+    return policy, policy.env_kwargs if env_kwargs is None else env_kwargs
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from pcil.errors import InputError
 
@@ -63,12 +63,19 @@ def expanded(path: Path) -> Path:
         raise InputError(f"{path} starts in the home of a user who is not known here; give the whole path.") from error
 
 
+def open_regular(path: Path) -> BinaryIO:
+    """A regular file, open to read from; `ValueError` where it is a pipe or a device, `OSError` as ever."""
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # a pipe nobody writes to must not block
+    file = open(os.open(path, flags), "rb")  # noqa: SIM115 - it is the caller's to close
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise ValueError("it is no regular file")
+    return file
+
+
 def read_text(path: Path, limit: int = LARGEST) -> str:
     """The text of a regular file; `ValueError` where it is a pipe, a device or larger than so many bytes, `OSError` as ever."""
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # a pipe nobody writes to must not block
-    with open(os.open(path, flags), "rb") as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise ValueError("it is no regular file")
+    with open_regular(path) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
         raise ValueError(f"it is larger than {limit:,} bytes")

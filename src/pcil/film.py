@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pcil import envs, seeds
-from pcil.policy import load_policy
+from pcil.evaluate import playable
 from pcil.report.load import Collection
 from pcil.seeds import Stream
 
 
-def films(found: Collection) -> dict[str, bytes]:
+def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
     """An animation by the first seed of each task, method and variant, under a title; one note of those that can't be made."""
     first = {name[:3]: name for name in sorted(found.sources, reverse=True)}
     made: dict[str, bytes] = {}
     refused: list[Exception] = []
     for name in sorted(first.values()):
         try:
-            made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder)
+            made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder, trust)
         except Exception as error:  # whatever OpenGL raises where it does not work
             refused.append(error)
     if refused:
@@ -28,12 +29,16 @@ def films(found: Collection) -> dict[str, bytes]:
     return made
 
 
-def film(folder: Path, steps: int = 160, every: int = 4) -> bytes:
-    """The first agent steps of an evaluation episode of a run's policy, every so many a picture: an animated WebP."""
+def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int = 4) -> bytes:
+    """The first agent steps of an evaluation episode of a run's policy, every so many a picture: an animated WebP.
+
+    `trust` are the modules that the run's files may name.
+    """
     from PIL import Image
 
-    policy = load_policy(folder)
-    with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=policy.env_kwargs) as env:
+    policy, env_kwargs = playable(folder, None, trust)
+    with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=env_kwargs) as env:
+        policy.check_fits(env)
         obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
         frames, over = [], False
         while not over and len(frames) * every < steps:

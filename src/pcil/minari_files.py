@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,8 +14,12 @@ from gymnasium.envs.registration import EnvSpec, registry
 from jaxtyping import Float
 
 from pcil.errors import InputError
-from pcil.files import read_json
+from pcil.files import parse_json, read_json
 from pcil.types import Episode, Origin
+
+PARTS = ("observations", "actions", "rewards", "terminations", "truncations")
+"""Of an episode; others, such as its infos, are never read."""
+SCALAR = {"type": "Box", "shape": []}
 
 
 class Stored(NamedTuple):
@@ -30,77 +32,68 @@ class Stored(NamedTuple):
     origin: Origin
     has_actions: bool
     has_rewards: bool
+    hash: Any
+    """`pcil.demos:Demonstrations.hash` when it was saved; None where that is unknown."""
 
 
-def read(data: Path) -> Stored:
-    """A dataset in any format that Minari can read here.
+def read(data: Path, *, trusted: bool = False) -> Stored:
+    """A dataset whose data are HDF5, read in a process of its own where it is not `trusted`.
 
-    Actions or rewards are absent where no episode has any: the file lacks them, or all of them are NaN.
+    Actions or rewards are absent where no episode has any: the file lacks them, or all of them are NaN. Minari's own reader is
+    not used: it follows a damaged or foreign file to other files, into crashes, and to whatever environment the file names.
     """
-    import h5py
-    from minari.dataset.minari_storage import MinariStorage
+    from pcil import hdf5
 
     where, episodes = str(data), []
     try:
         metadata = read_json(data / "metadata.json")
-        environment = json.loads(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", data.name)
+        environment = parse_json(metadata.get("env_spec", "{}")).get("id") or metadata.get("dataset_id", data.name)
         own = {"task": task_of(environment), "info": metadata} | metadata.get("pcil", {})
-        # Were the spaces missing, Minari would make the environment, and so run whatever code the file names.
-        spaces = [json.loads(metadata[key]) for key in ("observation_space", "action_space")]
+        spaces = [parse_json(metadata[key]) for key in ("observation_space", "action_space")]
         indices, steps = range(metadata["total_episodes"]), metadata["total_steps"]
         if not indices:
-            return Stored(own["task"], (), own["info"], Origin(), True, True)
-        if metadata["data_format"] == "hdf5":
-            if not h5py.is_hdf5(file := data / "main_data.hdf5"):
-                raise ValueError(f"{file.name} is {'not an HDF5 file' if file.exists() else 'missing'}")
-            with h5py.File(file) as groups:
-                if len(groups) != len(indices):
-                    raise ValueError(f"{file.name} has {len(groups)} episodes, metadata.json says {len(indices)}")
-        storage = MinariStorage.read(data)
-        stored = storage.get_episodes(indices)
-        if metadata["data_format"] == "hdf5" and (absent := _absent(file)):
-            stored = _without(storage, file, indices, absent)
-        where = f"Episode 0 of {data}"
-        for raw, known in zip(stored, storage.get_episode_metadata(indices), strict=True):
-            episodes.append(_episode(raw, known.get("seed"), *spaces))
+            return Stored(own["task"], (), own["info"], Origin(), True, True, None)
+        if not isinstance(own["task"], str) or not isinstance(own["info"], dict):
+            raise ValueError("its task is no name or its info no table")
+        if metadata["data_format"] != "hdf5":
+            raise ValueError(f"its data_format is {metadata['data_format']!r:.80}, and only hdf5 is read")
+        boxes: dict[str, Any] = {
+            key: list(_boxes(key, space)) for key, space in zip(PARTS, (spaces[0], *[SCALAR] * 4), strict=True)
+        }
+        boxes["actions"] = list(_boxes("actions", spaces[1])) if spaces[1]["type"] == "Box" else None
+        wanted = {"episodes": len(indices), "steps": steps, "boxes": boxes}
+        for seed, arrays in (hdf5.episodes if trusted else hdf5.read)(data / "main_data.hdf5", wanted):
             where = f"Episode {len(episodes)} of {data}"
-        where, found = str(data), sum(map(len, episodes))
-        if found != steps:
-            raise ValueError(f"there are {found} steps in all, metadata.json says {steps}")
+            episodes.append(_episode(arrays, seed, spaces[1]))
+        where = str(data)
         has_actions = any(episode.action.shape[1] for episode in episodes)
         has_rewards = not all(np.isnan(episode.reward).all() for episode in episodes)
         if not has_rewards:
             episodes = [dataclasses.replace(episode, reward=np.zeros(len(episode))) for episode in episodes]
         origin = _checked(Origin(**own["origin"]) if "origin" in own else _origin(metadata, spaces[1]))
-    except Exception as error:  # a damaged file may make json, h5py and Minari raise anything
+    except Exception as error:  # damaged JSON may make anything raise anything
+        if isinstance(error, hdf5.Damage):
+            where = str(data) if error.episode is None else f"Episode {error.episode} of {data}"
         raise InputError(f"{where} is not as Minari writes it and can not be read: {reason(error)}.") from error
-    return Stored(own["task"], tuple(episodes), own["info"], origin, has_actions, has_rewards)
+    return Stored(own["task"], tuple(episodes), own["info"], origin, has_actions, has_rewards, own.get("hash"))
 
 
-def _absent(file: Path) -> set[str]:
-    """Which of actions and rewards no episode of an HDF5 file has."""
-    import h5py
-
-    with h5py.File(file) as groups:
-        return {key for key in ("actions", "rewards") if not any(key in group for group in groups.values())}
-
-
-def _without(storage: Any, file: Path, indices: range, absent: set[str]) -> Iterator[dict[str, Any]]:
-    """The episodes as Minari gives them, with NaN for what is absent; Minari itself would refuse them."""
-    import h5py
-
-    with h5py.File(file) as groups:
-        for index in indices:
-            group: Any = groups[f"episode_{index}"]
-            raw = {key: group[key][()] for key in {"rewards", "terminations", "truncations"} - absent}
-            for key in {"observations", "actions"} - absent:
-                raw[key] = storage._decode_space(group[key], getattr(storage, f"{key[:-1]}_space"))
-            yield raw | {key: np.full(len(raw["terminations"]), np.nan) for key in absent}
+def _boxes(path: str, space: dict[str, Any]) -> Iterator[tuple[str, list[int]]]:
+    """Path and shape of each Box, the parts of Dicts and Tuples in the order that the environment gave them."""
+    if space["type"] in ("Dict", "Tuple"):
+        parts = space["subspaces"]
+        named = parts.items() if space["type"] == "Dict" else ((f"_index_{i}", part) for i, part in enumerate(parts))
+        for name, part in named:
+            yield from _boxes(f"{path}/{name}", part)
+    elif space["type"] != "Box":
+        raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box or Tuple, nested ones too")
+    else:
+        yield path, space["shape"]
 
 
 def _origin(metadata: dict[str, Any], action_space: dict[str, Any]) -> Origin:
     """What a dataset of others, or an older one of ours, tells of its environment."""
-    spec = json.loads(metadata.get("env_spec", "{}"))
+    spec = parse_json(metadata.get("env_spec", "{}"))
     known = Origin(spec.get("id"), spec.get("entry_point"), spec.get("kwargs"))
     if any(wrapper["name"] == "RescaleAction" for wrapper in spec.get("additional_wrappers") or ()):
         return known  # the box that is stored is the wrapper's
@@ -118,43 +111,30 @@ def _checked(origin: Origin) -> Origin:
     return origin._replace(action_low=low, action_high=high)
 
 
-def _episode(raw: dict[str, Any], seed: int | None, observation_space: dict, action_space: dict) -> Episode:
-    """One episode out of Minari's arrays; the spaces are those of the metadata, in JSON. `ValueError` if ill-formed."""
-    action, obs = _unit_actions(raw["actions"], action_space), _flat(raw["observations"], observation_space)
-    if not obs.shape[1]:
+def _episode(arrays: dict[str, list[Any]], seed: int | None, action_space: dict) -> Episode:
+    """One episode out of its arrays; the action space is the metadata's, in JSON. `ValueError` if ill-formed."""
+    parts = [array.reshape(len(array), -1) for array in arrays["observations"] if 0 not in array.shape]
+    if not parts:
         raise ValueError("its observations are rows of no numbers")
-    reward, *flags = (np.asarray(raw[key]) for key in ("rewards", "terminations", "truncations"))
-    reward = _flat(reward, {"type": "Box", "shape": []})[:, 0].astype("f4" if reward.dtype == np.float32 else "f8")
-    steps, lengths = len(action), (len(obs), len(reward), *map(len, flags))
-    if steps == 0 or lengths != (steps + 1, steps, steps, steps):
-        given = "{} observations, {} rewards, {} terminations and {} truncations".format(*lengths)
-        raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {steps} actions with {given}")
+    ends = arrays["terminations"][0]
+    action = _unit_actions(arrays["actions"][0], action_space) if "actions" in arrays else np.zeros((len(ends), 0))
+    reward = arrays["rewards"][0] if "rewards" in arrays else np.full(len(ends), np.nan)
+    reward = reward.astype("f4" if reward.dtype == np.float32 else "f8")
     with np.errstate(over="ignore"):  # what is too large becomes infinite here, and is refused as such
-        return Episode(obs.astype(np.float32), action.astype(np.float32), reward, bool(flags[0][-1]), seed)
+        obs = np.concatenate([part.astype(np.float32) for part in parts], axis=1)
+        return Episode(obs, action.astype(np.float32), reward, bool(ends[-1]), seed)
 
 
-def _unit_actions(stored: Any, space: dict[str, Any]) -> Float[np.ndarray, "T action"]:
+def _unit_actions(stored: np.ndarray, space: dict[str, Any]) -> Float[np.ndarray, "T action"]:
     """Actions brought from their box to [-1, 1]; rows of no numbers where all are NaN, which is how absent ones are stored."""
-    if isinstance(stored, np.ndarray) and stored.dtype.kind == "f" and stored.size and np.isnan(stored).all():
+    if stored.dtype.kind == "f" and stored.size and np.isnan(stored).all():
         return np.zeros((len(stored), 0))
     low, high = (np.ravel(space.get(bound, np.nan)).astype(np.float64) for bound in ("low", "high"))
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
         raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
     if not low.size:
         raise ValueError("its actions are rows of no numbers")
-    return (_flat(stored, space) - (high + low) / 2) / ((high - low) / 2)
-
-
-def _flat(values: Any, space: dict[str, Any]) -> Float[np.ndarray, "T dim"]:
-    """The values of `space` as rows of numbers, the parts of Dicts and Tuples in the order that the environment gave them."""
-    if space["type"] in ("Dict", "Tuple"):
-        parts = space["subspaces"].items() if space["type"] == "Dict" else enumerate(space["subspaces"])
-        return np.concatenate([_flat(values[key], part) for key, part in parts], axis=1)
-    if space["type"] != "Box":
-        raise ValueError(f"{space['type']} spaces are not supported, only Box and Dict of Box or Tuple, nested ones too")
-    if values.dtype.kind not in "fiub" or list(values.shape[1:]) != space["shape"]:
-        raise ValueError(f"{values.dtype} {values.shape[1:]} is stored where there must be numbers {space['shape']}")
-    return values.reshape(len(values), math.prod(space["shape"])).astype(np.float64)
+    return (stored.reshape(len(stored), -1).astype(np.float64) - (high + low) / 2) / ((high - low) / 2)
 
 
 def write(data: Path, dataset_id: str, kept: Stored) -> None:
@@ -171,7 +151,7 @@ def write(data: Path, dataset_id: str, kept: Stored) -> None:
     known = {"dataset_id": dataset_id, "minari_version": minari.__version__}
     described = {"description": f"Demonstrations of {kept.task} by {kept.info.get('expert', 'an unknown expert')}."}
     absent = [name for name in ("actions", "rewards") if not getattr(kept, f"has_{name}")]
-    own = {"task": kept.task, "info": kept.info, "origin": kept.origin._asdict(), "absent": absent}
+    own = {"task": kept.task, "info": kept.info, "origin": kept.origin._asdict(), "absent": absent, "hash": kept.hash}
     storage.update_metadata(known | described | {"pcil": own})
     for episode in kept.episodes:
         last = np.arange(len(episode)) == len(episode) - 1

@@ -9,7 +9,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -72,8 +72,11 @@ class Plan(NamedTuple):
     gpus: float | int
 
 
-def read(file: Path, out: Path) -> Plan:
-    """The runs of a file, each checked as `pcil train` checks it, and how they stand. Nothing is written."""
+def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
+    """The runs of a file, each checked as `pcil train` checks it, and how they stand. Nothing is written.
+
+    `trust` are the modules that the file may name.
+    """
     try:
         table = tomllib.loads(files.read_text(file))
     except (OSError, ValueError, RecursionError) as error:
@@ -89,7 +92,7 @@ def read(file: Path, out: Path) -> Plan:
             folder, found = out.absolute() / name, []
             words.append(f"--out={folder}")
             try:
-                arguments.train(words, lambda run, out, found=found: found.append(run) or 0)
+                arguments.train(words, lambda run, out, found=found: found.append(run) or 0, trust)
                 runs.check(found[0], folder)
             except InputError as error:
                 raise InputError(f"{where}, {name}: {error}") from error

@@ -18,6 +18,8 @@ from pcil.networks import MLP, Actor, Normalizer, Trunk
 from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"
+LARGEST = 2**30
+"""Bytes of the arrays of a policy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,18 @@ class Policy:
                 f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers; "
                 f"got an array of shape {obs.shape}."
             )
-        return self.actor(obs, np)
+        with np.errstate(all="ignore"):  # an action that is not finite is refused where it is used
+            return self.actor(obs, np)
+
+    def check_fits(self, env: Any) -> None:
+        """Raise `InputError` where a made environment has observations or actions of other sizes than the policy."""
+        obs, action = env.observation_space.shape, env.action_space.shape
+        if (obs, action) != ((self.spec.obs_dim,), (self.spec.action_dim,)):
+            raise InputError(
+                f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers and gives actions of "
+                f"{self.spec.action_dim}, but in its environment as it is made here they have shapes {obs} and {action}; give "
+                "--env-kwargs and the version of the environment that it was trained in."
+            )
 
     def save(self, folder: Path) -> None:
         """Write `policy.safetensors`, which holds its own checksum, and `policy.json` into `folder`, each by a rename, so
@@ -103,6 +116,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file; `ValueError` where they do not have the checksum that it holds, if it holds one."""
     from safetensors import safe_open
 
+    if path.stat().st_size > LARGEST:
+        raise ValueError(f"{path.name} is larger than {LARGEST:,} bytes")
     with safe_open(path, "np") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
         told = (file.metadata() or {}).get("sha256")
@@ -115,6 +130,10 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     """The actor from its arrays; every shape must follow from the one before."""
     if header["format"] != FORMAT:
         raise ValueError(f"format {header['format']!r} is not {FORMAT!r}")
+    for name, array in arrays.items():
+        arrays[name] = array.astype(np.float32, copy=False)
+        if array.dtype.kind != "f" or 0 in array.shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} of shape {array.shape} and dtype {array.dtype} must hold finite numbers")
     layers = range(int(header["layers"]))
     scaling = [arrays[name] for name in ("trunk.normalizer.mean", "trunk.normalizer.deviation") if name in arrays]
     normalizer = Normalizer(*scaling) if scaling else None  # older policies have the scale in their first layer
@@ -128,15 +147,17 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
         raise ValueError("its task is no name or its info no table")
     if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
         raise ValueError("its env_kwargs are no table")
+    if not (trunk.weight.ndim == 2 and all(bias.ndim == 1 for bias in biases)):
+        raise ValueError("its weights are no matrices or its biases no vectors")
     width = trunk.weight.shape[1]
     if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
         raise ValueError("the trunk's shapes do not fit")
     if any(array.shape != trunk.weight.shape[:1] for array in scaling):
         raise ValueError("the shapes of its scaling do not fit")
+    if scaling and not (scaling[1] > 0).all():
+        raise ValueError("its scaling has deviations that are not above 0")
     for weight, bias in zip(weights, biases, strict=True):
         if weight.shape != (width, *bias.shape):
             raise ValueError(f"a layer of shape {weight.shape} follows one of width {width}")
         width = bias.shape[0]
-    if not all(np.isfinite(array).all() for array in arrays.values()):
-        raise ValueError("it holds values that are not finite")
     return Actor(trunk, MLP(weights, biases))

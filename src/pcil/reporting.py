@@ -9,6 +9,7 @@ import tyro
 
 from pcil.errors import InputError, shown
 from pcil.files import expanded, room_for
+from pcil.modules import Trust
 
 
 def report(
@@ -16,6 +17,7 @@ def report(
     /,
     out: Path,
     rollouts: bool = True,
+    trust: Trust = (),
 ) -> int:
     """Draw figures, tables and a page from runs.
 
@@ -23,6 +25,7 @@ def report(
         paths: Run folders, folders that hold some at any depth, or files like results/*.csv.
         out: The report's folder, with index.html, figures and tables.
         rollouts: Play an episode with the networks of each run: their representation, and an animation of each method.
+        trust: Modules that the runs' files may name, whose code is then run, such as my.module.
     """
     try:
         from pcil.report import load, page
@@ -35,8 +38,8 @@ def report(
         if rollouts and found.sources:
             from pcil import film, representation
 
-            representation.add(found)
-            films = film.films(found)
+            representation.add(found, trust)
+            films = film.films(found, trust)
         print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
     return 0
 

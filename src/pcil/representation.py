@@ -6,10 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import compilation, envs, learner, loop, presets, runs, seeds
+from pcil import compilation, envs, learner, loop, modules, presets, runs, seeds
 from pcil.config import Run
 from pcil.errors import InputError
 from pcil.report.embedding import project
@@ -20,11 +21,16 @@ from pcil.types import Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
 """As many transitions as the paper's Figure 4 has."""
+NUMBERS = 2**28
+"""At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
 _NEVER = 2**62
 
 
-def add(found: Collection) -> None:
-    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not."""
+def add(found: Collection, trust: Sequence[str] = ()) -> None:
+    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not.
+
+    `trust` are the modules that the runs' files may name.
+    """
     try:
         compilation.use_cache()
     except InputError as error:
@@ -34,15 +40,15 @@ def add(found: Collection) -> None:
     for name, source in found.sources.items():
         last = [point for point in found.points if point[:4] == name][-1]
         try:
-            found.dots.extend(transitions(source, last))
-        except (InputError, ImportError) as error:
+            found.dots.extend(transitions(source, last, trust))
+        except Exception as error:  # a run's files may hold anything
             refused.append(error)
     found.dots.sort(key=place)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
 
 
-def transitions(source: Source, row: Point) -> list[Dot]:
+def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[Dot]:
     """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
 
     Empty where the run's reward has no representation; `InputError` where it can't be restored.
@@ -50,9 +56,15 @@ def transitions(source: Source, row: Point) -> list[Dot]:
     run = restored(source.settings)
     if type(run.reward).representation is Reward.representation:
         return []
+    modules.admit(f"The run in {source.folder}", modules.of_task(run.task, run.env_kwargs), trust)
     demos = runs.demonstrations(run)
     assert demos is not None
     with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:
+        fresh = jax.eval_shape(lambda: loop.start(run, envs.spec(env), demos.episodes).learner)
+        if (numbers := sum(leaf.size for leaf in jax.tree.leaves(fresh))) > NUMBERS:
+            raise InputError(
+                f"The run in {source.folder} has networks of {numbers:,} numbers; at most {NUMBERS:,} are restored."
+            )
         state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), lambda text: None)
         if not state.counters.episodes:
             raise InputError(f"{source.folder} holds no checkpoint that can be read.")

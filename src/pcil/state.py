@@ -63,7 +63,8 @@ def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     for episode in itertools.cycle(demos):
         if left <= 0:
             break
-        replay.add(episode, np.asarray(reward + run.reward.task_weight * episode.reward, np.float32))
+        paid = run.reward.task_weight * episode.reward if run.reward.task_weight else np.zeros(len(episode))
+        replay.add(episode, np.asarray(reward + paid, np.float32))
         left -= len(episode)
     actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())

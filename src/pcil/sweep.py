@@ -13,7 +13,7 @@ import socket
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +40,16 @@ VISIBLE_SECONDS = 15.0
 """How long a finished run's DONE is waited for."""
 
 
-def sweep(file: Path, out: Path, limit: int | None, address: str | None, console: Console) -> int:
-    """Finish every run of a file, at most `limit` at a time; 1 where some failed, 130 or 143 where a signal stopped them."""
+def sweep(file: Path, out: Path, limit: int | None, address: str | None, console: Console, trust: Sequence[str] = ()) -> int:
+    """Finish every run of a file, at most `limit` at a time; 1 where some failed, 130 or 143 where a signal stopped them.
+
+    `trust` are the modules that the file may name.
+    """
 
     def say(text: str) -> None:
         console.print("\n".join(map(shown, text.split("\n"))), highlight=False, markup=False, soft_wrap=True)
 
-    plan = read(file, out)
+    plan = read(file, out, trust)
     left = sum(job.state != "done" for job in plan.jobs)
     say(f"{left} of {len(plan.jobs)} runs are left to do.")
     signals = Signals(lambda: say("Each run stops after its episode; Ctrl-C again stops at once."))
@@ -99,7 +102,8 @@ def _cluster(plan: Plan, limit: int | None, address: str | None) -> Iterator[Any
             raise InputError(f"Nothing answers at {address} ({error}); give the HOST:PORT of a Ray cluster's head.") from error
     for attempts_left in range(0 if address else STARTS - 1, -1, -1):
         try:
-            ray.init(**options, runtime_env={"env_vars": workers}, log_to_driver=False, logging_level=logging.ERROR)
+            with contextlib.chdir(Path.cwd().anchor):  # Ray's workers look there first for every module
+                ray.init(**options, runtime_env={"env_vars": workers}, log_to_driver=False, logging_level=logging.ERROR)
             break
         except Exception as error:  # Ray has no one type for an address where no cluster is, or none that takes us
             if not attempts_left:

@@ -76,7 +76,7 @@ class DAC(Reward):
         expert_logit, agent_logit = jnp.split(logits, [expert.shape[0]])
         entropy = binary_cross_entropy(expert_logit, agent_logit)
         mixed = interpolate(jax.random.uniform(key, (expert.shape[0], 1)), expert, agent[: expert.shape[0]])
-        slope = gradient_penalty(lambda x: discriminator(x)[:, 0], mixed)
+        slope = gradient_penalty(lambda x: discriminator(x)[:, 0], mixed) if self.penalty else jnp.zeros(())
         right = jnp.mean(expert_logit > 0, dtype=jnp.float32) + jnp.mean(agent_logit < 0, dtype=jnp.float32)
         metrics = {
             "entropy_loss": entropy,

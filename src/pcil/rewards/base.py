@@ -159,4 +159,5 @@ def label(
     """
     rows, row_actions = states_read(settings, obs).reshape(-1, obs.shape[-1]), action.reshape(-1, action.shape[-1])
     learned = settings.reward(state, rows, row_actions, embed, key=key)
-    return learned.reshape(task_reward.shape) + settings.task_weight * task_reward
+    learned = learned.reshape(task_reward.shape)
+    return learned + settings.task_weight * task_reward if settings.task_weight else learned  # 0 * NaN would be NaN

@@ -87,14 +87,17 @@ class PCIL(Reward):
             return gradient_penalty(lambda x: jnp.sum(unit_sphere(encoder(x)) * fixed, axis=-1), mixed)
 
         every = self.penalty_every
-        penalty = slope() if every == 1 else every * jax.lax.cond(count % every == 0, slope, lambda: jnp.zeros(()))
+        if not self.penalty:
+            penalty = jnp.zeros(())
+        else:
+            penalty = slope() if every == 1 else every * jax.lax.cond(count % every == 0, slope, lambda: jnp.zeros(()))
         metrics = diagnostics | {
             "contrast_loss": loss,
             "penalty": penalty,
             "embedding_norm": jnp.mean(jnp.linalg.norm(raw, axis=-1)),
         }
         loss = loss + self.penalty * penalty
-        if self.stages:
+        if self.stages and self.stage_weight:
             assert number is not None
             metrics["stage_loss"] = group_info_nce(negatives, stages(number, self.stages), anchor, self.temperature)
             loss = loss + self.stage_weight * metrics["stage_loss"]

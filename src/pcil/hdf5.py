@@ -1,0 +1,231 @@
+"""Numbers out of HDF5 files that anybody may have written: what a file says of its arrays is checked before they are read.
+
+The HDF5 library follows a file to other files, to code and out of memory. So here nothing but plain arrays in the file itself
+can be named, and only as many numbers are read as `NUMBERS`. What the library does not see, such as an index that leads back to
+itself, ends the process or never ends; so a file is read in a process of its own, which is this module as a script.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from pcil import files
+
+_low: Any = h5py  # whose modules of low-level functions have no types
+h5a, h5d, h5l, h5o, h5s, h5t, h5z = (getattr(_low, f"h5{letter}") for letter in "adlostz")
+
+NUMBERS = 2**29
+"""At most so many numbers are read of a file: 2 GiB in float32."""
+UNFOLDED = 2**26
+"""So many bytes any file may unfold to; of more, each byte of the file may stand for at most `RATIO`."""
+RATIO = 1100
+"""As deflate, the strongest of the `FILTERS`, makes 1 byte of 1032 at most."""
+CHUNK = 2**26
+"""Bytes of a chunk of an array, where the whole array is not larger."""
+PACKED = 2**21
+"""Bytes of a packed chunk, which may unfold to `RATIO` times as many before its size is known to be wrong."""
+HEADER = 2**16
+"""Bytes of what describes an array or a group; types can be nested in it."""
+MEMORY = 2**34
+"""Bytes of address space of the process that reads."""
+PATIENCE_SECONDS, BYTES_A_SECOND = 30.0, 5e6
+"""How long a file may take, and how much longer for its size."""
+FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_LZF, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
+"""What arrays may be packed with; the library looks for the code of others in folders of the machine."""
+
+
+Parts = dict[str, list[Any]]
+"""The arrays of an episode: for each of its parts those of the Boxes that it is made of."""
+
+
+class Damage(ValueError):
+    """What is wrong with a file, and in which episode, if in one."""
+
+    def __init__(self, text: str, episode: int | None) -> None:
+        super().__init__(text)
+        self.episode = episode
+
+
+def read(path: Path, wanted: dict[str, Any]) -> list[tuple[int | None, Parts]]:
+    """`episodes`, read in another process; `Damage` too where that crashes or does not end."""
+    seconds = PATIENCE_SECONDS + (path.stat().st_size if path.exists() else 0) / BYTES_A_SECOND
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-P", __file__, str(path)]
+    try:
+        asked = {"input": json.dumps(wanted).encode(), "timeout": seconds, "env": environment}
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True, **asked)
+    except subprocess.TimeoutExpired:
+        raise Damage(f"reading it did not end within {seconds:.0f} s", None) from None
+    except subprocess.CalledProcessError as error:
+        raise Damage(f"the HDF5 library can't read it (exit code {error.returncode})", None) from None
+    answer, found = io.BytesIO(done.stdout), []
+    while line := answer.readline():
+        about = json.loads(line)
+        if "error" in about:
+            raise Damage(about["error"], about["episode"])
+        numbers = {key: [np.lib.format.read_array(answer) for _ in range(count)] for key, count in about["parts"].items()}
+        found.append((about["seed"], numbers))
+    return found
+
+
+def main() -> None:
+    """Answer to `read`: the path is the argument, what is wanted comes in, and episodes or what is wrong go out."""
+    with contextlib.suppress(ImportError, ValueError, OSError):  # not every system has such a limit
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard), hard))
+    out = sys.stdout.buffer
+    try:
+        for seed, parts in episodes(Path(sys.argv[1]), json.load(sys.stdin)):
+            about = {"seed": seed, "parts": {key: len(arrays) for key, arrays in parts.items()}}
+            out.write(json.dumps(about).encode() + b"\n")
+            for array in (array for arrays in parts.values() for array in arrays):
+                np.lib.format.write_array(out, array)
+    except Damage as error:
+        out.write(json.dumps({"error": str(error), "episode": error.episode}).encode() + b"\n")
+
+
+def episodes(path: Path, wanted: dict[str, Any]) -> Iterator[tuple[int | None, Parts]]:
+    """The seed and the arrays of each episode of a Minari file; `Damage` where it is not as it must be.
+
+    `wanted` says how many "episodes" and "steps" there are in all, and of each part of an episode the "boxes", with path and
+    shape of a row. Actions and rewards may be in no episode at all.
+    """
+    index = None
+    try:
+        with opened(path) as file:
+            count, groups, located = wanted["episodes"], [], []
+            if len(file) != count:
+                raise ValueError(f"{path.name} has {len(file)} episodes, metadata.json says {count}")
+            for index in range(count):
+                groups.append(member(file, f"episode_{index}"))
+            absent = {key for key in ("actions", "rewards") if not any(has(group, key) for group in groups)}
+            boxes = {key: value for key, value in wanted["boxes"].items() if key not in absent}
+            for index in range(count):
+                located.append(_located(groups[index], boxes))
+            index, steps = None, sum(len(parts["terminations"][0]) for parts in located)
+            if steps != wanted["steps"]:
+                raise ValueError(f"there are {steps} steps in all, metadata.json says {wanted['steps']}")
+            check_size((array for parts in located for arrays in parts.values() for array in arrays), path)
+            for index in range(count):
+                numbers = {key: [array[()] for array in arrays] for key, arrays in located[index].items()}
+                yield integer(groups[index], "seed"), numbers
+    except Exception as error:  # h5py raises anything on what is damaged
+        raise Damage(str(error) or type(error).__name__, index) from error
+
+
+def _located(group: h5py.Group, boxes: dict[str, Any]) -> Parts:
+    """The arrays of an episode, not read yet; each has the rows that it must have, or `ValueError`."""
+    if boxes.get("actions", ()) is None:
+        raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
+    parts = {key: [array(group, path, shape) for path, shape in inner] for key, inner in boxes.items()}
+    lengths = {key: {len(array) for array in arrays} or {0} for key, arrays in parts.items()}
+    steps = max(lengths["terminations"])
+    if not steps or any(length != {steps + (key == "observations")} for key, length in lengths.items()):
+        told = {key: " or ".join(map(str, sorted(length))) for key, length in lengths.items()}
+        told = {"actions": "no", "rewards": "no"} | told
+        given = "{actions} actions with {observations} observations, {rewards} rewards, {terminations} terminations and "
+        given = (given + "{truncations} truncations").format_map(told)
+        raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {given}")
+    return parts
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file to read from; `ValueError` where it is none, or a pipe or a device."""
+    if not path.exists():
+        raise ValueError(f"{path.name} is missing")
+    files.open_regular(path).close()
+    if not h5py.is_hdf5(path):
+        raise ValueError(f"{path.name} is not an HDF5 file")
+    with h5py.File(path, "r") as file:
+        yield file
+
+
+def has(group: Any, name: str) -> bool:
+    """Whether this is a group that has a member of this name, which may be a link to nowhere."""
+    return isinstance(group, h5py.Group) and group.id.links.exists(name.encode())
+
+
+def member(group: h5py.Group, path: str) -> Any:
+    """A group or an array in the same file, named without links; `ValueError` where there is none."""
+    found: Any = group
+    for name in path.split("/"):
+        if not has(found, name):
+            raise ValueError(f"there is no {path!r}")
+        if found.id.links.get_info(name.encode()).type != h5l.TYPE_HARD:
+            raise ValueError(f"{path} is a link to another place")
+        if h5o.get_info(found.id, name.encode()).hdr.space.total > HEADER:
+            raise ValueError(f"{path} is described in more than {HEADER:,} bytes")
+        found = found[name]
+    return found
+
+
+def array(group: h5py.Group, path: str, shape: list[int]) -> h5py.Dataset:
+    """An array of rows of this shape, not read yet; `ValueError` where it is anything but plain numbers in the file itself."""
+    found = member(group, path)
+    if not isinstance(found, h5py.Dataset):
+        raise ValueError(f"{path} is no array")
+    plan, kind = found.id.get_create_plist(), found.id.get_type().get_class()
+    if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
+        raise ValueError(f"{path} is stored elsewhere than in its own place in this file")
+    if kind not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) or found.id.get_space().get_simple_extent_type() != h5s.SIMPLE:
+        raise ValueError(f"{path} holds text, objects or nothing where there must be rows of numbers")
+    if found.dtype.kind not in "fiub" or list(found.shape[1:]) != shape or (kind == h5t.ENUM and found.dtype != bool):
+        raise ValueError(f"{found.dtype} {found.shape[1:]} is stored as {path} where there must be numbers {shape}")
+    if plan.get_layout() == h5d.CHUNKED:
+        _check_chunks(found, path, plan)
+    return found
+
+
+def _check_chunks(found: h5py.Dataset, path: str, plan: Any) -> None:
+    if (size := math.prod(plan.get_chunk()) * found.dtype.itemsize) > max(CHUNK, found.nbytes):
+        raise ValueError(f"{path} is stored in chunks of {size:,} bytes, more than {CHUNK:,} and than it has itself")
+    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+    packing = [code for code in filters if code in (h5z.FILTER_DEFLATE, h5z.FILTER_LZF)]
+    if not FILTERS.issuperset(filters) or len(set(filters)) < len(filters) or len(packing) > 1:
+        raise ValueError(f"{path} is packed by the filters {filters}; it may be packed by gzip or lzf")
+    packed: list[int] = []
+    if packing:
+        found.id.chunk_iter(lambda chunk: packed.append(chunk.size))
+    if max(packed, default=0) > PACKED:
+        raise ValueError(f"{path} has a packed chunk of {max(packed):,} bytes; it may have {PACKED:,}")
+
+
+def check_size(arrays: Iterable[h5py.Dataset], path: Path) -> None:
+    """`ValueError` where all that is to be read of a file is too much, or more than the file can hold."""
+    arrays = list(arrays)
+    if (numbers := sum(math.prod(array.shape) for array in arrays)) > NUMBERS:
+        raise ValueError(f"{path.name} holds {numbers:,} numbers, and at most {NUMBERS:,} are read")
+    size = path.stat().st_size
+    if (unfolded := sum(array.nbytes for array in arrays)) > max(UNFOLDED, RATIO * size):
+        raise ValueError(f"{path.name} has {size:,} bytes and says that it unfolds to {unfolded:,}, more than packing can do")
+
+
+def integer(group: h5py.Group, name: str) -> int | None:
+    """An attribute that is a whole number, None where there is none of this name; `ValueError` where it is something else."""
+    if not h5a.exists(group.id, name.encode()):
+        return None
+    found = h5a.open(group.id, name.encode())
+    if found.get_type().get_class() != h5t.INTEGER or found.get_space().get_simple_extent_npoints() != 1:
+        raise ValueError(f"its {name} is no whole number")
+    value = np.zeros(found.shape, np.int64)
+    found.read(value)
+    return int(value.item())
+
+
+if __name__ == "__main__":
+    main()

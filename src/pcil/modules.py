@@ -1,0 +1,48 @@
+"""Code that a person brings as `module:Name`: a module that a file names is imported only where that person trusts it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from pcil.errors import InputError, brief
+
+Trust = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE ...")]
+"""The option that says which modules a file may name."""
+_NAMED = re.compile(r"([^\W\d][\w.]*):[\w-]")
+
+
+def of_task(task: str, env_kwargs: Any = None) -> list[str]:
+    """The modules that Gymnasium imports for a task, and those that look like code in its environment's keyword arguments."""
+    return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
+
+
+def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:
+    """Let the modules that `source` names be imported, from the present folder too, which is searched last.
+
+    `trust` are the modules that a file may name, each with all that is in it; None where a person typed the names. `InputError`
+    where another module is named.
+    """
+    for name in (names := list(names)):
+        if trust is not None and not any(f"{name}.".startswith(f"{trusted}.") for trusted in trust):
+            raise InputError(
+                f"{source} names code of the module {brief(name)}, and a file's code is not run unless you trust it; read it, "
+                f"and give --trust {name} if you do."
+            )
+    with contextlib.suppress(OSError):  # the present folder may be gone
+        if names and (here := os.getcwd()) not in sys.path:
+            sys.path.append(here)
+
+
+def _of_values(values: Any) -> list[str]:
+    if isinstance(values, str):
+        found = _NAMED.match(values)
+        return [found[1]] if found else []
+    parts = [*values, *values.values()] if isinstance(values, dict) else values if isinstance(values, list) else []
+    return [name for part in parts for name in _of_values(part)]

@@ -160,7 +160,6 @@ def _evaluate(words: list[str]) -> int:
 
 def _demos(words: list[str]) -> int:
     """List the demonstrations that ship."""
-
     import tyro
 
     def demos(json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
@@ -228,7 +227,6 @@ def _record(words: list[str]) -> int:
 
 def _theory(words: list[str]) -> int:
     """Check the paper's Theorem 1 numerically, and draw it."""
-
     import tyro
 
     def check(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
@@ -293,7 +291,6 @@ def _sweep(words: list[str]) -> int:
 
 def _bench(words: list[str]) -> int:
     """Measure the speed of each part, and its ratio to the floor."""
-
     import tyro
 
     def bench(

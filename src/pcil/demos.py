@@ -102,8 +102,7 @@ class Demonstrations:
 
     @property
     def return_std(self) -> float | None:
-        """The population standard deviation of the returns (divided by the number of episodes; 0 for one episode); None
-        without rewards."""
+        """The population standard deviation of the returns, divided by the number of episodes; None without rewards."""
         return float(self.returns.std()) if self.has_rewards else None
 
     @property
@@ -127,8 +126,8 @@ class Demonstrations:
         return digest.hexdigest()
 
     def validate(self, spec: Spec | None) -> Demonstrations:
-        """These demonstrations; `InputError` if there are none, if values are not finite, if actions leave [-1, 1], or
-        if shapes differ from those of the environment's `spec` (from the first episode's, if that is None)."""
+        """These demonstrations; `InputError` if there are none, if values are not finite, if actions leave [-1, 1], or if
+        shapes differ from those of the environment's `spec` (from the first episode's, if that is None)."""
         _check(self, f"the demonstrations of {self.task}", spec)
         return self
 
@@ -163,8 +162,7 @@ class Demonstrations:
                 unfinished = Path(scratch) / "dataset"
                 size = sum(e.obs.nbytes + e.action.nbytes + e.reward.nbytes for e in self.episodes)
                 files.reserve(Path(scratch), 2 * size + 2**16 * len(self.episodes) + 2**20)  # HDF5 dies on a full disk
-                kept = (getattr(self, name) for name in Stored._fields)
-                write(unfinished / "data", dataset_id, Stored(*kept))
+                write(unfinished / "data", dataset_id, Stored(*(getattr(self, name) for name in Stored._fields)))
                 unfinished.rename(folder)
         except (OSError, TypeError, ValueError) as error:
             why = f"{folder} can not be written ({reason(error)}): the place must be writable, the info JSON."

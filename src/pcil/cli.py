@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import importlib
+import io
 import json
 import os
 import sys
@@ -23,6 +24,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "" not in sys.path:
         sys.path.insert(0, "")  # a module of one's own environment or reward may lie in the present folder
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that can't show every letter
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = _command(words)

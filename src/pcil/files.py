@@ -6,7 +6,8 @@ import contextlib
 import json
 import os
 import stat
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ LARGEST = 16 * 2**20
 """Bytes of a file that is read whole."""
 DIGITS = 300
 """Of a whole number in JSON; a float holds no more."""
+DEPTH = 100
+"""Of tables and lists within each other: what is deeper could be read and then not be shown."""
 
 
 @contextlib.contextmanager
@@ -74,8 +77,28 @@ def read_json(path: Path, limit: int = LARGEST) -> Any:
 
 def parse_json(text: str | bytes) -> Any:
     """What JSON text says; `ValueError` too where it is nested too deeply, or holds a whole number that no float holds."""
+    return _shallow(lambda: json.loads(text, parse_int=_whole))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file holds; `ValueError` or `OSError` where it can't be read."""
+    text = read_text(path)
+    return _shallow(lambda: tomllib.loads(text))
+
+
+def _shallow(parse: Callable[[], Any]) -> Any:
+    """What is parsed, if it is nested no deeper than `DEPTH`, or else `ValueError`."""
+
+    def check(value: Any, left: int) -> None:
+        if left < 0:
+            raise RecursionError
+        for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            check(part, left - 1)
+
     try:
-        return json.loads(text, parse_int=_whole)
+        value = parse()
+        check(value, DEPTH)
+        return value
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 

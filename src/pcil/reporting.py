@@ -36,7 +36,7 @@ def report(
 
         representation.add(found)
         films = film.films(found)
-    print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
+    print("\n".join(map(shown, [*found.notes, f"Report: {page.build(found, out, films)}"])))
     return 0
 
 

@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 
 from pcil import presets
-from pcil.report.load import NO_VARIANT, flat, place, read_run, write_points
+from pcil.report.load import flat, place, read_run, write_points
+from pcil.report.variants import NO_VARIANT
 
 
 def main(target: str, *folders: str) -> None:

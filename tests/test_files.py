@@ -152,6 +152,8 @@ def test_text_is_read_up_to_its_limit(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("[" * 100_000 + "]" * 100_000, "nested too deeply"),
+        ("[" * 101 + "[]" + "]" * 101, "nested too deeply"),
+        ('{"a":' * 101 + "[]" + "}" * 101, "nested too deeply"),
         ("1" * 400, "a number of 400 digits"),
         ("1" * 5000, "a number of 5,000 digits"),
         ("-" + "1" * 400, "digits"),
@@ -165,6 +167,21 @@ def test_json_that_can_not_be_read_is_a_value_error(text: str, said: str, tmp_pa
     (tmp_path / "file.json").write_text(text)
     with pytest.raises(ValueError, match=said):
         files.read_json(tmp_path / "file.json")
+
+
+def test_what_is_nested_less_deeply_is_read(tmp_path: Path) -> None:
+    assert str(files.parse_json("[" * 99 + '{"a": []}' + "]" * 99)).count("[") == 100
+    (tmp_path / "file.toml").write_text(f"x{'.x' * 99} = 1")
+    assert str(files.read_toml(tmp_path / "file.toml")).count("{") == 100
+
+
+@pytest.mark.parametrize(
+    "text", [f"x{'.x' * 200} = 1", f"x = {'[' * 200}{']' * 200}", f"[{'x.' * 20_000}x]", "x = " + "[" * 9000]
+)
+def test_toml_that_can_not_be_read_is_a_value_error(text: str, tmp_path: Path) -> None:
+    (tmp_path / "file.toml").write_text(text)
+    with pytest.raises(ValueError, match=r"nested too deeply|^TOML inline arrays|nvalid"):
+        files.read_toml(tmp_path / "file.toml")
 
 
 def test_json_is_what_it_was() -> None:
@@ -287,7 +304,7 @@ def test_whatever_can_not_be_written_any_more_is_one_sentence_and_nothing_is_los
 
 
 def test_a_run_that_is_refused_for_its_size_leaves_its_folder_free(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = "train toy/point_mass-v0 --method expert --frames 200 --replay-steps 100000000000 --out run"
+    words = "train toy/point_mass-v0 --method expert --frames 5000 --replay-steps 100000000000 --out run"
     assert cli.main(words.split()) == 2
     assert capsys.readouterr().err.startswith("pcil: The run in run stopped: there is not enough memory")
     assert not (tmp_path / "run" / "run.json").exists()

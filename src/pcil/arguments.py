@@ -136,3 +136,10 @@ def _complaint(box: str) -> str:
         if header in meant:
             wrong += f"; {words} {meant[header].strip()}"
     return wrong
+
+
+def at_least(least: int, **options: int) -> None:
+    """`InputError` where the number of an option is below the least that it may be."""
+    for name, value in options.items():
+        if value < least:
+            raise InputError(f"--{name} is {value}; it must be at least {least}.")

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import importlib
+import io
 import json
 import os
 import sys
@@ -21,6 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 on success, 2 on bad input, 1 where a run failed, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
     # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that can't show every letter
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = _command(words)
@@ -139,10 +142,10 @@ def _evaluate(words: list[str]) -> int:
         from pcil.evaluate import environments_for, playable
         from pcil.evaluate import evaluate as roll_out
 
-        _at_least(1, episodes=episodes)
-        _at_least(0, seed=seed)
-        policy, arguments = playable(folder, env_kwargs, trust)
-        copies = environments_for(policy.task, episodes, arguments, single=single_environment)
+        arguments.at_least(1, episodes=episodes)
+        arguments.at_least(0, seed=seed)
+        policy, env_kwargs = playable(folder, env_kwargs, trust)
+        copies = environments_for(policy.task, episodes, env_kwargs, single=single_environment)
         with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
             policy.check_fits(made[0])
             result = roll_out(policy, made, seed=seed, episodes=episodes)
@@ -205,16 +208,16 @@ def _record(words: list[str]) -> int:
         """
         from pcil import demos, envs, evaluate, runs
 
-        _at_least(1, episodes=episodes)
-        _at_least(0, seed=seed)
+        arguments.at_least(1, episodes=episodes)
+        arguments.at_least(0, seed=seed)
         demos.free_folder(out)
-        policy, arguments = evaluate.playable(folder, env_kwargs, trust)
+        policy, played = evaluate.playable(folder, env_kwargs, trust)
         least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
         least += "" if env_kwargs is None else f" --env-kwargs '{json.dumps(env_kwargs)}'"
         least += f" --trust {' '.join(trust)}" if trust else ""
         info = runs.provenance(folder, policy, f"pcil record {folder} --episodes {episodes} --seed {seed}{least} --out {out}")
         asked: Any = {"task": policy.task, "seed": seed, "minimum_return": minimum_return, "info": info}
-        with envs.opened(policy.task, env_kwargs=arguments) as env:
+        with envs.opened(policy.task, env_kwargs=played) as env:
             policy.check_fits(env)
             recorded = demos.record(policy, env, episodes, **asked)
         path = recorded.save(out)
@@ -239,7 +242,7 @@ def _theory(words: list[str]) -> int:
         """
         from pcil import theory
 
-        _at_least(0, seed=seed)
+        arguments.at_least(0, seed=seed)
         pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
         figures = theory.measure(pairs)
         drawn = ""
@@ -283,7 +286,7 @@ def _sweep(words: list[str]) -> int:
         """
         from pcil import files, progress, sweep
 
-        _at_least(1, jobs=1 if jobs is None else jobs)
+        arguments.at_least(1, jobs=1 if jobs is None else jobs)
         return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout), trust)
 
     return arguments.call("sweep", sweep, words)
@@ -328,12 +331,6 @@ def _doctor(words: list[str]) -> int:
         return doctor.report()
 
     return arguments.call("doctor", doctor, words)
-
-
-def _at_least(least: int, **options: int) -> None:
-    for name, value in options.items():
-        if value < least:
-            raise InputError(f"--{name} is {value}; it must be at least {least}.")
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

@@ -9,7 +9,8 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +25,8 @@ NO_ROOM = {
 }
 DIGITS = 300
 """Of a whole number in JSON; a float holds no more."""
+DEPTH = 100
+"""Of tables and lists within each other: what is deeper could be read and then not be shown."""
 
 
 @contextlib.contextmanager
@@ -146,8 +149,28 @@ def read_json(path: Path, limit: int = LARGEST) -> Any:
 
 def parse_json(text: str | bytes) -> Any:
     """What JSON text says; `ValueError` too where it is nested too deeply, or holds a whole number that no float holds."""
+    return _shallow(lambda: json.loads(text, parse_int=_whole))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """What a TOML file holds; `ValueError` or `OSError` where it can't be read."""
+    text = read_text(path)
+    return _shallow(lambda: tomllib.loads(text))
+
+
+def _shallow(parse: Callable[[], Any]) -> Any:
+    """What is parsed, if it is nested no deeper than `DEPTH`, or else `ValueError`."""
+
+    def check(value: Any, left: int) -> None:
+        if left < 0:
+            raise RecursionError
+        for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+            check(part, left - 1)
+
     try:
-        return json.loads(text, parse_int=_whole)
+        value = parse()
+        check(value, DEPTH)
+        return value
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 

@@ -18,12 +18,12 @@ def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
     """An animation by the first seed of each task, method and variant, under a title; one note of those that can't be made."""
     first = {name[:3]: name for name in sorted(found.sources, reverse=True)}
     made: dict[str, bytes] = {}
-    refused: list[Exception] = []
+    refused: list[str] = []
     for name in sorted(first.values()):
         try:
             made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder, trust)
         except Exception as error:  # whatever OpenGL raises where it does not work
-            refused.append(error)
+            refused.append(f"{found.sources[name].folder}, {error}")
     if refused:
         found.notes.append(f"{len(refused)} of {len(first)} animations are left out: {refused[0]}")
     return made

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,8 +77,8 @@ def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
     `trust` are the modules that the file may name.
     """
     try:
-        table = tomllib.loads(files.read_text(file))
-    except (OSError, ValueError, RecursionError) as error:
+        table = files.read_toml(file)
+    except (OSError, ValueError) as error:
         raise InputError(f"{file} can't be read as TOML ({error}).") from error
     _check(str(file), table, FILE)
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))

@@ -40,7 +40,7 @@ def report(
 
             representation.add(found, trust)
             films = film.films(found, trust)
-        print("\n".join([*map(shown, found.notes), f"Report: {page.build(found, out, films)}"]))
+        print("\n".join(map(shown, [*found.notes, f"Report: {page.build(found, out, films)}"])))
     return 0
 
 

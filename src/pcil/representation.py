@@ -36,13 +36,13 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
     except InputError as error:
         found.notes.append(f"The representations are left out: {error}")
         return
-    refused: list[Exception] = []
+    refused: list[str] = []
     for name, source in found.sources.items():
         last = [point for point in found.points if point[:4] == name][-1]
         try:
             found.dots.extend(transitions(source, last, trust))
-        except Exception as error:  # a run's files may hold anything
-            refused.append(error)
+        except Exception as error:  # whatever a damaged folder or somebody's environment raises
+            refused.append(f"{source.folder}, {error}")
     found.dots.sort(key=place)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
@@ -85,7 +85,7 @@ def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
     try:
         return flat(_made(settings).plain.to_json()) | settings
-    except (InputError, TypeError, AttributeError):
+    except Exception:  # presets are made for settings of every kind, here of a file from anywhere
         return settings
 
 

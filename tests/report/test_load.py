@@ -11,8 +11,8 @@ import pytest
 from fake_runs import fake_run, fake_sweep
 from pcil.config import MACHINE_SETTINGS
 from pcil.errors import InputError
-from pcil.report import load
 from pcil.report.load import Dot, Point, collect, curves, flat, label, matrix, read_points, read_run, write_points
+from pcil.report.variants import NO_VARIANT
 
 
 def make_run(folder: Path) -> Path:
@@ -169,7 +169,7 @@ def test_settings_that_a_run_lacks_may_be_completed(tmp_path: Path) -> None:
 
 
 def test_settings_of_the_machine_make_no_variant() -> None:
-    assert set(MACHINE_SETTINGS) <= set(load.NO_VARIANT)
+    assert set(MACHINE_SETTINGS) <= set(NO_VARIANT)
 
 
 def test_the_same_run_twice_is_shown_once_and_said(tmp_path: Path) -> None:
@@ -187,7 +187,8 @@ def test_what_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:
     found = collect([tmp_path])
     assert [source.folder.name for source in found.sources.values()] == ["good"]
     young, torn = sorted(found.notes, key=lambda note: "torn" in note)
-    assert "young has no evaluation yet" in young and "torn holds no run that can be read" in torn
+    assert young == f"left out: {tmp_path / 'young'}, it has no evaluation yet"
+    assert torn == f"left out: {tmp_path / 'torn'}, eval.csv can't be read (No such file or directory)"
 
 
 def test_without_any_run_the_reason_is_given(tmp_path: Path) -> None:

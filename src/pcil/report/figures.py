@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 
+from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.load import OFFLINE, Dot, Point, curves, label, matrix, read_run
 
@@ -65,6 +67,11 @@ OTHERS = [
 """Methods that are not ours, in the order of their names; and variants of a method after its first."""
 
 
+def words(text: str) -> str:
+    """A name as a figure shows it: short, and its dollar signs begin no formula."""
+    return shown(text, 70).replace("$", "\\$")
+
+
 def styles(rows: Iterable[Point | Dot]) -> dict[tuple[str, str], Style]:
     """A look for each method and variant: the method's own, and another one for each further variant of it."""
     found: dict[tuple[str, str], Style] = {}
@@ -89,13 +96,13 @@ def run_curve(folder: Path, expert_return: float | None) -> Path:
     colour = STYLES.get(method, OTHERS[0]).colour
     axis.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
     axis.plot(frames, [point.return_mean for point in points], color=colour, marker="o", markersize=3, label="mean")
-    shown = low + high
+    drawn = low + high
     if expert_return is not None:
-        shown.append(_expert(axis, expert_return))
-    _finish(axis, f"{task} - {method} ({preset}, seed {seed})", "return", shown)
+        drawn.append(_expert(axis, expert_return))
+    _finish(axis, words(f"{task} - {method} ({preset}, seed {seed})"), "return", drawn)
     axis.legend(frameon=False, fontsize=8)
     path = folder / "curve.png"
-    figure.savefig(path, dpi=150)
+    _write(figure, path, dpi=150)
     plt.close(figure)
     return path
 
@@ -118,17 +125,17 @@ def grid(
     figure, axes = _axes(len(tasks), columns)
     for axis, task in zip(axes, tasks, strict=True):
         mine = curves(point for point in points if point.task == task)
-        shown = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
+        drawn = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
         for name in (name for name in looks if (task, *name) in mine):
             if name[0] in OFFLINE:
-                _level(axis, matrix(mine[task, *name], value)[1][:, -1].mean(), looks[name], label(name, looks))
+                _level(axis, matrix(mine[task, *name], value)[1][:, -1].mean(), looks[name], words(label(name, looks)))
             else:
-                _seeds(axis, mine[task, *name], value, looks[name], label(name, looks))
+                _seeds(axis, mine[task, *name], value, looks[name], words(label(name, looks)))
         if value == "return_mean":
             experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
-            shown += [_expert(axis, expert) for expert in experts if expert is not None]
+            drawn += [_expert(axis, expert) for expert in experts if expert is not None]
         ylabel = {"return_mean": "return", "correlation": "correlation with true reward"}[value]
-        _finish(axis, f"{task}, {_span('seed', mine)}", ylabel, shown)
+        _finish(axis, f"{words(task)}, {_span('seed', mine)}", ylabel, drawn)
     return save(figure, path)
 
 
@@ -146,21 +153,21 @@ def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], 
     if not strata:
         return ""
     figure, (axis,) = _axes(1, 1)
-    shown = [1.0]
+    drawn = [1.0]
     for name in (name for name in looks if name in strata):
         tasks = strata[name]
         frames = np.array(sorted(set.intersection(*(set(own.tolist()) for own, _ in tasks))))
         scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        middle, words = stats.iqm(*scores), label(name, looks)
+        middle, named = stats.iqm(*scores), words(label(name, looks))
         if len({len(tasks) for tasks in strata.values()}) > 1:
-            words += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
+            named += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
         if name[0] in OFFLINE:
-            _level(axis, middle[-1], looks[name], words)
+            _level(axis, middle[-1], looks[name], named)
         else:
-            _line(axis, frames, middle, stats.bootstrap(stats.iqm, scores), looks[name], words)
-        shown += middle.tolist()
+            _line(axis, frames, middle, stats.bootstrap(stats.iqm, scores), looks[name], named)
+        drawn += middle.tolist()
     _expert(axis, 1.0)
-    _finish(axis, _span("task", strata), "share of expert (IQM)", shown)
+    _finish(axis, _span("task", strata), "share of expert (IQM)", drawn)
     return save(figure, path)
 
 
@@ -171,8 +178,8 @@ def clouds(dots: Sequence[Dot], path: Path, columns: int | None = None) -> str:
     figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
     for axis, name in zip(axes, ((*task, *method) for method in methods for task in tasks), strict=True):
         if name in first:
-            shown = [dot for other, own in first.items() if other[0] == name[0] for dot in own]
-            rewards = [dot.reward for dot in shown if dot.reward is not None]
+            drawn = [dot for other, own in first.items() if other[0] == name[0] for dot in own]
+            rewards = [dot.reward for dot in drawn if dot.reward is not None]
             _cloud(axis, first[name], (min(rewards), max(rewards)))
         else:
             axis.axis("off")
@@ -190,12 +197,18 @@ def save(figure: Figure, path: Path) -> str:
         figure.set_figheight(figure.get_figheight() + LEGEND_ROW * (-(-len(lines) // columns) - 1))
         look = {"ncols": columns, "frameon": False, "fontsize": 8}
         figure.legend(lines.values(), lines, loc="outside lower center", **look)
-    figure.savefig(path.with_suffix(".png"), dpi=130)
-    figure.savefig(path.with_suffix(".pdf"), metadata={"CreationDate": None})
+    _write(figure, path.with_suffix(".png"), dpi=130)
+    _write(figure, path.with_suffix(".pdf"), metadata={"CreationDate": None})
     text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None}, dpi=130)
+    _write(figure, text, format="svg", metadata={"Date": None}, dpi=130)
     plt.close(figure)
     return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())  # 0.01 pt is enough
+
+
+def _write(figure: Figure, file: Path | io.StringIO, **options: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # of a name in letters that the font lacks
+        figure.savefig(file, **options)
 
 
 def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> tuple[Figure, list[Axes]]:
@@ -253,7 +266,7 @@ def _cloud(axis: Axes, dots: Sequence[Dot], ends: tuple[float, float]) -> None:
     bar.solids.set_rasterized(True)
     axis.set(xticks=[], yticks=[])
     task, method, variant, seed, frames = dots[0][:5]
-    axis.set_title(f"{task}, {method}, {variant}\nseed {seed}, {frames:,} frames", fontsize=8)
+    axis.set_title(f"{words(f'{task}, {method}, {variant}')}\nseed {seed}, {frames:,} frames", fontsize=8)
 
 
 def _expert(axis: Axes, value: float) -> float:
@@ -270,9 +283,9 @@ def _span(word: str, groups: Mapping[Any, Sized]) -> str:
     return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
 
 
-def _finish(axis: Axes, title: str, ylabel: str, shown: Sequence[float]) -> None:
-    """Words, and limits that hold every value of `shown`; a wide band may reach beyond them."""
-    low, high = min(shown), max(shown)
+def _finish(axis: Axes, title: str, ylabel: str, drawn: Sequence[float]) -> None:
+    """Words, and limits that hold every value of `drawn`; a wide band may reach beyond them."""
+    low, high = min(drawn), max(drawn)
     room = 0.08 * (high - low) or 1
     axis.set(title=title, xlabel="frames (environment control steps)", ylabel=ylabel)
     axis.set_ylim(0 if low >= 0 else low - room, high + room)  # most returns; some environments pay less than nothing

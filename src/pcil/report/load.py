@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import csv
-import itertools
-from collections import Counter
+import functools
+import io
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from types import NoneType
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 
-from pcil.errors import InputError
-from pcil.files import parse_json, read_json
+from pcil.errors import InputError, brief, shown
+from pcil.files import parse_json, read_json, read_text
+from pcil.report.variants import LONGEST, variants
 
 OFFLINE = ("bc",)
 """Methods that take no step in the environment; their frames only count updates, two frames each where actions are repeated."""
-NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds", "single_environment")
-"""Settings by which two runs may differ and still be seeds, or tasks, of one variant."""
+LARGEST = 1e50
+"""Magnitude of a number, whose square is finite too."""
+LARGEST_FILE = 2**28
+"""Bytes of a log or a file of results."""
+UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError, csv.Error)
+"""What reading a damaged file may raise."""
 
 
 class Point(NamedTuple):
@@ -96,7 +103,11 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; give run folders, folders that hold some, or files like results/*.csv.")
-        rows = read_points(path) if path.is_file() else []
+        try:
+            rows = read_points(path) if path.is_file() else []
+        except InputError as error:
+            notes.append(left_out(path, error.__cause__))
+            continue
         others = {shown.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
         notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
         rows = [row for row in rows if shown[type(row), *row[:4]] == path]
@@ -106,11 +117,12 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
     runs = []
     for folder in folders.values():
         try:
-            rows, about = read_run(folder), read_json(folder / "run.json")
-            runs.append((rows, Source(folder, complete(flat(about["run"])), (folder / "DONE").exists())))
-        except InputError as error:
-            notes.append(str(error))
-    for (rows, source), variant in zip(runs, _variants([source.settings for _, source in runs]), strict=True):
+            rows, run, torn = _read(folder)
+            notes += [left_out(folder, "the end of eval.csv, whose last line is half written")] if torn else []
+            runs.append((rows, Source(folder, complete(flat(run)), (folder / "DONE").exists())))
+        except UNREADABLE as error:
+            notes.append(left_out(folder, error))
+    for (rows, source), variant in zip(runs, variants([source.settings for _, source in runs]), strict=True):
         name = (*rows[0][:2], variant, rows[0].seed)
         first = sources.setdefault(name, source)
         if first is source:
@@ -120,7 +132,8 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
             notes.append(f"{source.folder} holds the same run as {first.folder}, which is shown.")
     if not points:
         where = ", ".join(map(str, paths)) or "nothing"
-        raise InputError([*notes, f"There is no run in {where}; give folders that pcil train made."][0])
+        reason = f" ({notes[0]})" if notes else ""
+        raise InputError(f"There is no run in {where}{reason}; give folders that pcil train made.")
     dots.sort(key=place)
     for name, seeds in curves(points).items():
         if not len(matrix(seeds)[0]):
@@ -128,6 +141,13 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
             notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {first} is shown.")
             points[:] = [point for point in points if point[:3] != name or point.seed == first]
     return found._replace(points=list({point[:5]: point for point in sorted(points, key=place)}.values()))
+
+
+def left_out(where: Path, reason: Any) -> str:
+    """A note of what is not shown."""
+    if isinstance(reason, OSError) and reason.filename:
+        reason = f"{Path(reason.filename).name} can't be read ({reason.strerror})"
+    return f"left out: {shown(str(where), 500)}, {shown(str(reason), 500)}"
 
 
 def place(row: Point | Dot) -> tuple[Any, ...]:
@@ -159,35 +179,91 @@ def matrix(runs: Sequence[Sequence[Point]], value: str = "return_mean") -> tuple
 def read_run(folder: Path, variant: str | None = None) -> list[Point]:
     """The evaluations of a run folder in the order of time. `InputError` where the folder holds no run."""
     try:
-        about, columns, log = read_json(folder / "run.json"), read_evaluations(folder), folder / "train.jsonl"
-        whole = log.read_text().split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line at the end
-        episodes = [episode for line in whole if "correlation" in (episode := parse_json(line))]
-        run, expert = about["run"], (about["demos"] or {}).get("return_mean")
-        head = {"task": run["task"], "method": run["method"], "variant": variant or run["preset"], "seed": run["seed"]}
-        tail = {"expert_return": expert and round(float(expert), 4), "commit": about["commit"] or ""}
-        points, before = [], -1.0
-        for frames in dict.fromkeys(columns["frames"].tolist()):
-            now = columns["frames"] == frames
-            mean, low, high = (round(float(f(columns["return"][now])), 2) for f in (np.mean, np.min, np.max))
-            fresh = [episode["correlation"] for episode in episodes if before < episode["frames"] <= frames]
-            fresh = [correlation for correlation in fresh if correlation]  # null, or 0 in older logs, where one does not vary
-            returns = {"return_mean": mean, "return_low": low, "return_high": high}
-            seconds, health = float(columns["seconds"][now][0]), round(float(np.mean(fresh)), 4) if fresh else None
-            points.append(Point(**head, frames=int(frames), **returns, **tail, seconds=seconds, correlation=health))
-            before = frames
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        return _read(folder, variant)[0]
+    except UNREADABLE as error:
         raise InputError(f"{folder} holds no run that can be read ({error}); give folders that pcil train made.") from error
+
+
+def _read(folder: Path, variant: str | None = None) -> tuple[list[Point], dict[str, Any], bool]:
+    """The evaluations of a run folder, its settings, and whether an evaluation was half written; raises what is among
+    `UNREADABLE`."""
+    about, (columns, torn), log = read_json(folder / "run.json"), _evaluations(folder), folder / "train.jsonl"
+    run, demos, commit = (
+        _part(about, name, kind, NoneType) for name, kind in (("run", dict), ("demos", dict), ("commit", str))
+    )
+    names = {name: _part(run, name, str) for name in ("task", "method", "preset")}
+    seed, _ = _part(run, "seed", int), _part(run, "frames", int, NoneType)
+    expert = _part(demos or {}, "return_mean", int, float, NoneType)
+    head = (names["task"], names["method"], variant or names["preset"], seed)
+    tail = (expert and round(expert, 4), commit or "")
+    whole = read_text(log, LARGEST_FILE).split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line
+    episodes = [episode for line in whole if "correlation" in (episode := parse_json(line))]
+    ends = [(_part(e, "frames", int), _part(e, "correlation", int, float, NoneType)) for e in episodes]
+    points, before = [], -1.0
+    if np.any(columns["frames"] % 1) or np.any(np.diff(columns["frames"]) < 0):
+        raise ValueError("the frames in eval.csv are no whole numbers that grow")
+    for frames in dict.fromkeys(columns["frames"].tolist()):
+        returns, seconds = (columns[name][columns["frames"] == frames] for name in ("return", "seconds"))
+        mean, low, high = (round(float(f(returns)), 2) for f in (np.mean, np.min, np.max))
+        fresh = [correlation for end, correlation in ends if before < end <= frames and correlation]  # null, or 0 in older
+        health = round(float(np.mean(fresh)), 4) if fresh else None  # logs, where one of the two does not vary
+        points.append(_checked(Point(*head, int(frames), mean, low, high, *tail, float(seconds[0]), health)))
+        before = frames
     if not points:
-        raise InputError(f"The run in {folder} has no evaluation yet; let it go on for a moment.")
-    return points
+        raise ValueError("it has no evaluation yet")
+    return points, run, torn
+
+
+def _part(table: Any, name: str, *kinds: type) -> Any:
+    """A value of a table, None where it lacks that; `ValueError` where it is of none of these kinds."""
+    value = table.get(name) if isinstance(table, dict) else table
+    if not isinstance(table, dict) or type(value) not in kinds:
+        raise ValueError(f"its {name} is {brief(value)}")
+    return value
+
+
+def _checked(row: Row) -> Row:
+    """The row; `ValueError` where a value is not of its column's type, no printable name of at most `LONGEST` letters or no
+    number up to `LARGEST`."""
+    for name, hint in _hints(type(row)).items():
+        value: Any = getattr(row, name)
+        if isinstance(value, str):
+            fits = hint is str and value.isprintable() and len(value) <= LONGEST and (value or name == "commit")
+        elif value is None:
+            fits = hint == float | None
+        else:
+            fits = hint is not str and abs(value) <= LARGEST and (hint is not int or 0 <= value < 2**53)
+        if not fits:
+            raise ValueError(f"its {name} is {brief(value)}")
+    return row
+
+
+@functools.cache
+def _hints(kind: type[Point] | type[Dot]) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
-    """The columns of a run's `eval.csv`, as arrays."""
-    with (folder / "eval.csv").open() as file:
-        table = csv.DictReader(file)
-        rows = list(table)
-    return {name: np.array([float(row[name]) for row in rows]) for name in table.fieldnames or ()}
+    """The columns of a run's `eval.csv`, as arrays; `ValueError` where it holds anything else than finite numbers."""
+    return _evaluations(folder)[0]
+
+
+def _evaluations(folder: Path) -> tuple[dict[str, np.ndarray], bool]:
+    """The columns without an evaluation whose last line is half written, and whether there was one."""
+    whole, _, half = read_text(folder / "eval.csv", LARGEST_FILE).rpartition("\n")
+    table = csv.DictReader(io.StringIO(whole))
+    rows = list(table)
+    columns = {name: np.array([float(row[name] or "") for row in rows]) for name in table.fieldnames or ()}
+    if missing := {"frames", "return", "seconds"} - set(columns):
+        raise ValueError(f"eval.csv has no column {', '.join(sorted(missing))}")
+    if any(None in row for row in rows):
+        raise ValueError("eval.csv has a line of more values than columns")
+    if not all(np.isfinite(column).all() for column in columns.values()):
+        raise ValueError("eval.csv holds a number that is not finite")
+    first, last = (columns["frames"] == frames for frames in (columns["frames"][:1], columns["frames"][-1:]))
+    if half and last.sum() < first.sum():
+        columns = {name: column[~last] for name, column in columns.items()}
+    return columns, bool(half)
 
 
 def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -199,61 +275,42 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
+def plain(text: str) -> str:
+    """Text of a CSV file's cell that no spreadsheet takes for a formula: one that looks like one has a ' before it."""
+    return f"'{text}" if re.match(r"'*[=+\-@\t\r]", text) else text
+
+
 def write_points(path: Path, rows: Sequence[Point] | Sequence[Dot]) -> None:
     """One header and a row a point or a dot; the whole file or, without rows, nothing and `InputError`."""
     if not rows:
         raise InputError(f"There are no rows to write to {path}; it stays as it is.")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.tmp")
-    with partial.open("w", newline="") as file:
+    with partial.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(rows[0]._fields)
-        table.writerows(rows)
+        table.writerows([plain(value) if isinstance(value, str) else value for value in row] for row in rows)
     partial.replace(path)
 
 
 def read_points(path: Path) -> list[Any]:
     """The `Point`s or `Dot`s that `write_points` wrote; columns that a file of an older version lacks are None."""
     try:
-        with path.open() as file:
-            table = list(csv.DictReader(file))
-        kind = Dot if table and "silhouette" in table[0] else Point
-        parse = {name: _PARSERS[hint] for name, hint in get_type_hints(kind).items()}
-        return [kind(**{name: parse[name](value) for name, value in row.items()}) for row in table]
-    except (OSError, ValueError, LookupError, TypeError, csv.Error) as error:
+        table = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_FILE))))
+        kind: Any = Dot if table and "silhouette" in table[0] else Point
+        parse = {name: _PARSERS[hint] for name, hint in _hints(kind).items()}
+        rows = [_checked(kind(**{name: parse[name](value) for name, value in row.items()})) for row in table]
+        for runs in curves(row for row in rows if isinstance(row, Dot)).values():
+            if any(len({dot.reward is None for dot in run}) < 2 for run in runs):
+                raise ValueError("it has a run without transitions of expert and agent")
+        return rows
+    except UNREADABLE as error:
         raise InputError(f"{path} is no file of results ({error}); give one like those in results/.") from error
 
 
-_PARSERS = {str: str, int: int, float: float, float | None: lambda text: float(text) if text else None}
-
-
-def _variants(runs: Sequence[dict[str, Any]]) -> list[str]:
-    """The preset of each run, and the settings in which runs of its method and preset differ on one task, but for what most
-    of these runs have.
-
-    A budget is told only beside another one of the same task: there the usual one goes without, or the longest where the task
-    does not have that. Otherwise a task with budgets of its own would part a method's other tasks.
-    """
-    differing: dict[tuple[str, str], set[str]] = {}
-    for one, other in itertools.combinations(runs, 2):
-        if all(one[name] == other[name] for name in ("task", "method", "preset")):
-            names = {name for name in one | other if one.get(name) != other.get(name)} - set(NO_VARIANT)
-            differing.setdefault((one["method"], one["preset"]), set()).update(names)
-    usual: dict[tuple[str, str], dict[str, Any]] = {}
-    for kind, names in differing.items():
-        for name in names:
-            values = Counter(str(run.get(name)) for run in runs if (run["method"], run["preset"]) == kind).most_common(2)
-            if len(values) == 1 or values[0][1] > values[1][1]:
-                usual.setdefault(kind, {})[name] = values[0][0]
-    budgets: dict[tuple[str, str, str], set[int]] = {}
-    for run in runs:
-        budgets.setdefault((run["task"], run["method"], run["preset"]), set()).add(run["frames"])
-    labels = []
-    for run in runs:
-        kind = run["method"], run["preset"]
-        there, plain = budgets[run["task"], *kind], dict(usual.get(kind, {}))
-        if not any(plain.get("frames") == str(frames) for frames in there):
-            plain["frames"] = str(max(there))
-        told = [(name, str(run.get(name))) for name in sorted(differing.get(kind, ()))]
-        labels.append(", ".join([run["preset"], *(f"{name}={value}" for name, value in told if plain.get(name) != value)]))
-    return labels
+_PARSERS = {
+    str: lambda text: re.sub(r"^'(?='*[=+\-@\t\r])", "", text),
+    int: int,
+    float: float,
+    float | None: lambda text: float(text) if text else None,
+}

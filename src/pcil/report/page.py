@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jinja2 import Environment
 
-from pcil.errors import InputError
+from pcil.errors import InputError, shown
 from pcil.report import figures, tables
 from pcil.report.load import Collection, write_points
 
@@ -47,7 +47,7 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     if found.dots:
         write_points(out / "tables" / "transitions.csv", found.dots)
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["cell"] = tables.cell
+    environment.filters |= {"cell": tables.cell, "shown": lambda value: shown(str(value), 500)}
     page = environment.from_string(Path(__file__).with_name("page.html").read_text()).render(
         tasks=list(dict.fromkeys(point.task for point in found.points)),
         methods=list(dict.fromkeys(point.method for point in found.points)),
@@ -57,17 +57,18 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
         figures=draw(found, out / "figures"),
         films={title: _uri("webp", film) for title, film in films.items()},
     )
-    (out / "index.html").write_text(page)
+    (out / "index.html").write_text(page, encoding="utf-8")
     return out / "index.html"
 
 
 def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
     """Every figure into `folder`; for the page, by heading and then by title, as data URIs."""
     points, looks = found.points, figures.styles(found.points)
+    files = _file_names([row.task for row in (*points, *found.dots)])
     svg: dict[str, dict[str, str]] = {"Learning curves": {}}
     figures.grid(points, folder / "curves", looks=looks)  # all tasks on one sheet, as papers print it
     for task in dict.fromkeys(point.task for point in points):
-        path = folder / f"curves-{_plain(task)}"
+        path = folder / f"curves-{files[task]}"
         svg["Learning curves"][task] = figures.grid([p for p in points if p.task == task], path, looks=looks)
     if together := figures.aggregate(points, folder / "aggregate", looks):
         svg["Learning curves"]["all tasks"] = together
@@ -76,14 +77,18 @@ def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
     if found.dots:
         figures.clouds(found.dots, folder / "representation")
     for task in dict.fromkeys(dot.task for dot in found.dots):
-        path, mine = folder / f"representation-{_plain(task)}", [dot for dot in found.dots if dot.task == task]
+        path, mine = folder / f"representation-{files[task]}", [dot for dot in found.dots if dot.task == task]
         svg.setdefault("t-SNE", {})[task] = figures.clouds(mine, path, columns=2)
     return {heading: {title: _uri("svg+xml", t.encode()) for title, t in drawn.items()} for heading, drawn in svg.items()}
 
 
-def _plain(task: str) -> str:
-    """A task's name as part of a file's."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", task)
+def _file_names(tasks: Iterable[str]) -> dict[str, str]:
+    """A part of a file's name for each task, that no other task has."""
+    names: dict[str, str] = {}
+    for task in dict.fromkeys(tasks):
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", task)[:100]
+        names[task] = f"{name}_{len(names)}" if name in names.values() else name
+    return names
 
 
 def _uri(kind: str, data: bytes) -> str:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import OFFLINE, Collection, Point, curves, label, matrix
+from pcil.report.load import OFFLINE, Collection, Point, curves, label, matrix, plain
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -200,23 +202,28 @@ def cell(value: Any) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table alone, with a line break at its end."""
-    rows = [table.header, ["---"] * len(table.header), *(map(cell, row) for row in table.rows)]
+    """The table alone, with a line break at its end; no text in it is markup."""
+
+    def escaped(value: Any) -> str:
+        return re.sub(r"[\\`*<\[|&$~]", r"\\\g<0>", shown(value)) if isinstance(value, str) else cell(value)
+
+    rows = [map(escaped, table.header), ["---"] * len(table.header), *(map(escaped, row) for row in table.rows)]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def write(name: str, table: Table, folder: Path) -> None:
     """`<name>.md` with title and note, and `<name>.csv`, where an interval has three columns."""
     title, note = words(MAKERS[name])
-    (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}")
+    (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}", encoding="utf-8")
     wide = [isinstance(value, Interval) for value in table.rows[0]]
     header = [(name, f"{name} low", f"{name} high") if w else (name,) for name, w in zip(table.header, wide, strict=True)]
-    with (folder / f"{name}.csv").open("w", newline="") as file:
+    with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(itertools.chain(*header))
+        rows.writerow(map(plain, itertools.chain(*header)))
         for row in table.rows:
             flat = itertools.chain(*(value if isinstance(value, Interval) else (value,) for value in row))
-            rows.writerow([round(value, 6) if isinstance(value, float) else value for value in flat])
+            cells = (plain(value) if isinstance(value, str) else value for value in flat)
+            rows.writerow([round(value, 6) if isinstance(value, float) else value for value in cells])
 
 
 def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:

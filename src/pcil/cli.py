@@ -1,7 +1,6 @@
 """The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
 
 import contextlib
-import errno
 import importlib
 import io
 import json
@@ -11,8 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pcil import arguments
-from pcil.errors import InputError, shown
+from pcil import arguments, errors
+from pcil.errors import InputError, brief, shown
 
 if TYPE_CHECKING:
     from pcil.config import Run
@@ -31,10 +30,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _command(words)
         sys.stdout.flush()
         return code
-    except InputError as error:
-        sentence = " ".join(str(error).split())  # what a library said may have line breaks
-        print(f"pcil: {shown(sentence.removesuffix('.'))}.", file=sys.stderr)
-        return error.exit_code
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
@@ -43,12 +38,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of the rest at its end
         return 141
-    except OSError as error:
-        if error.filename is None and error.errno != errno.ENOSPC:
+    except Exception as error:
+        if not (said := errors.said(error)):
             raise
-        where = shown(str(error.filename or "standard output"), 500)
-        print(f"pcil: {where} can't be read or written ({error.strerror}).", file=sys.stderr)
-        return 2
+        print(f"pcil: {said[0]}.", file=sys.stderr)
+        return said[1]
 
 
 def _command(words: list[str]) -> int:
@@ -140,8 +134,8 @@ def _evaluate(words: list[str]) -> int:
         from pcil.evaluate import evaluate as roll_out
         from pcil.policy import load_policy
 
-        _at_least(1, episodes=episodes)
-        _at_least(0, seed=seed)
+        _within(1, 100_000, episodes=episodes)
+        _within(0, 2**31 - 1, seed=seed)
         policy = load_policy(folder)
         arguments = policy.env_kwargs if env_kwargs is None else env_kwargs
         copies = environments_for(policy.task, episodes, arguments, single=single_environment)
@@ -207,8 +201,8 @@ def _record(words: list[str]) -> int:
         from pcil.policy import load_policy
         from pcil.runs import provenance
 
-        _at_least(1, episodes=episodes)
-        _at_least(0, seed=seed)
+        _within(1, 100_000, episodes=episodes)
+        _within(0, 2**31 - 1, seed=seed)
         demos.free_folder(out)
         policy = load_policy(folder)
         least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
@@ -219,7 +213,7 @@ def _record(words: list[str]) -> int:
             recorded = demos.record(policy, env, episodes, **asked)
         path = recorded.save(out)
         returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
-        print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {path}")
+        print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {shown(str(path))}")
         return 0
 
     return arguments.call("record", record, words)
@@ -240,7 +234,7 @@ def _theory(words: list[str]) -> int:
         """
         from pcil import theory
 
-        _at_least(0, seed=seed)
+        _within(0, 2**31 - 1, seed=seed)
         pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
         figures = theory.measure(pairs)
         drawn = ""
@@ -250,7 +244,7 @@ def _theory(words: list[str]) -> int:
             except ImportError:
                 drawn = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
             else:
-                drawn = f"Figure: {draw(pairs, out or Path())}"
+                drawn = shown(f"Figure: {draw(pairs, out or Path())}")
         print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")
         if json_output and drawn:
             print(drawn, file=sys.stderr)
@@ -282,7 +276,7 @@ def _sweep(words: list[str]) -> int:
         """
         from pcil import files, progress, sweep
 
-        _at_least(1, jobs=1 if jobs is None else jobs)
+        _within(1, 100_000, jobs=1 if jobs is None else jobs)
         return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout))
 
     return arguments.call("sweep", sweep, words)
@@ -330,10 +324,11 @@ def _doctor(words: list[str]) -> int:
     return arguments.call("doctor", doctor, words)
 
 
-def _at_least(least: int, **options: int) -> None:
+def _within(least: int, most: int, **options: int) -> None:
     for name, value in options.items():
-        if value < least:
-            raise InputError(f"--{name} is {value}; it must be at least {least}.")
+        if not least <= value <= most:
+            limit = f"at least {least}" if value < least else f"at most {most:,}"
+            raise InputError(f"--{name} is {brief(value)}; it must be {limit}.")
 
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {

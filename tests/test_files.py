@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 import pcil
+from fake_runs import fake_run
 from pcil import cli, files, loop, runs
 from pcil.errors import InputError, shown
 from small import save_point_mass_demos, small_run
@@ -341,6 +343,24 @@ def test_what_is_shown_is_printable_and_short(text: str, said: str) -> None:
         ["train", "toy/point_mass-v0", "--method", "expert", "--out", "~no such user/run"],
         ["report", "~no such user/run", "--out", "new"],
         ["sweep", "\x1b[31m.toml", "--out", "~no such user/run"],
+        *(
+            [*words.split(), "9" * 400]
+            for words in (
+                "train toy/point_mass-v0 --method expert --out run --frames",
+                "train toy/point_mass-v0 --method expert --out run --evaluate-every",
+                "train toy/point_mass-v0 --method expert --out run --agent.noise.steps",
+                "evaluate run --episodes",
+                "evaluate run --seed",
+                "record run --out new --episodes",
+                "sweep sweep.toml --out new --jobs",
+                "theory --seed",
+            )
+        ),
+        ["bench", "--task", "x" * 5000],
+        ["bench", "--preset", "x" * 5000],
+        ["record", "run", "--out", "x" * 5000],
+        ["demos", "x" * 5000],
+        ["doctor", "--" + "x" * 5000],
         ["train", "toy/point_mass-v0", "--method", "\x1b[31mred", "--out", "run"],
     ],
     ids=lambda words: words[0][:8],
@@ -349,3 +369,80 @@ def test_hostile_arguments_are_one_short_printable_line(words: list[str], capsys
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.startswith("pcil: ") and err.endswith("\n") and err[:-1].isprintable() and len(err) < 1600
+
+
+HOSTILE_SWEEPS = [
+    "x" * 5000,
+    f"tasks = ['{'x' * 5000}']\nmethods = ['pcil']\nseeds = [1]",
+    "tasks = ['a\\u0000b']\nmethods = ['pcil']\nseeds = [1]",
+    "tasks = ['\\u001B[31m']\nmethods = ['pcil']\nseeds = [1]",
+    f"tasks = ['toy/point_mass-v0']\nmethods = ['expert']\nseeds = [{'9' * 400}]",
+    f"tasks = ['toy/point_mass-v0']\nmethods = ['expert']\nseeds = [{'9' * 5000}]",
+    "tasks = ['toy/point_mass-v0']\nmethods = ['pcil']\nseeds = [1]\n[settings]\ndemos = 'a\\u0000b'",
+    f"tasks = ['toy/point_mass-v0']\nmethods = ['expert']\nseeds = [1]\n[settings]\nenv_kwargs = {{a = {'[' * 90}{']' * 90}}}",
+    f"tasks = ['toy/point_mass-v0']\nmethods = ['expert']\nseeds = [1]\n[variants.{'x' * 5000}]\nlabel = 'stored'",
+    f"tasks = ['toy/point_mass-v0']\nmethods = ['expert']\nseeds = [1]\ncores = {'9' * 400}",
+    f"tasks = {'[' * 99}{']' * 99}",
+]
+
+
+@pytest.mark.parametrize("text", HOSTILE_SWEEPS, ids=range(len(HOSTILE_SWEEPS)))
+def test_a_hostile_sweep_is_one_short_printable_line(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("sweep.toml").write_text(text)
+    assert cli.main(["sweep", "sweep.toml", "--out", "out"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("pcil: ") and err.endswith("\n") and err[:-1].isprintable() and len(err) < 1600
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), 1),
+        (OSError(errno.ENOMEM, "Cannot allocate memory", "x" * 5000), 1),
+        (MemoryError(), 1),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes."), 1),
+        (ValueError("RESOURCE_EXHAUSTED: Error opening"), 1),
+        (RuntimeError("can't start new thread"), 1),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 5000), 2),
+    ],
+    ids=str,
+)
+def test_what_the_system_refuses_is_one_sentence(
+    error: Exception, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def raises(_: list[str]) -> int:
+        raise error
+
+    monkeypatch.setitem(cli.COMMANDS, "demos", raises)
+    assert cli.main(["demos"]) == code
+    err = capsys.readouterr().err
+    assert err.startswith("pcil: ") and err.count("\n") == 1 and len(err) < 700
+
+
+def test_what_is_none_of_these_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    def raises(_: list[str]) -> int:
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setitem(cli.COMMANDS, "demos", raises)
+    with pytest.raises(RuntimeError, match="a mistake of ours"):
+        cli.main(["demos"])
+
+
+@pytest.mark.parametrize("words", ["n 20", "v 1000000"])
+def test_limits_that_are_too_low_are_said_before_anything_begins(words: str) -> None:
+    train = f"ulimit -{words}; {sys.executable} -m pcil train toy/point_mass-v0 --method expert --out run --frames 5000"
+    result = subprocess.run(["sh", "-c", train], capture_output=True, text=True)
+    assert result.returncode == 2 and result.stdout == "" and not Path("run", "run.json").exists()
+    assert re.fullmatch(r"pcil: This process may have too little \(ulimit.*\n", result.stderr)
+
+
+def test_a_terminal_that_can_not_show_every_letter_stops_nothing(tmp_path: Path) -> None:
+    fake_run(tmp_path / "\u884c", [])
+    fake_run(tmp_path / "a", [1.0])
+    result = subprocess.run(
+        [sys.executable, "-m", "pcil", "report", ".", "--out", "out", "--no-rollouts"],
+        capture_output=True,
+        text=True,
+        env=dict(os.environ, PYTHONIOENCODING="ascii"),
+    )
+    assert result.returncode == 0 and "left out: \\u884c, it has no evaluation yet" in result.stdout

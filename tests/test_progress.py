@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -12,10 +14,10 @@ from pcil.progress import Bar, compared
 from small import small_run
 
 
-def shown(expert: float | None) -> str:
+def shown(expert: float | None, **changes: Any) -> str:
     """Everything that a terminal of 140 columns gets from one evaluation and two episodes."""
     stream = io.StringIO()
-    run = small_run("expert", frames=100_000)
+    run = dataclasses.replace(small_run("expert", frames=100_000), **changes)
     with Bar(Console(file=stream, force_terminal=True, width=140, color_system=None), expert) as bar:
         bar.evaluation(run, 0, Evaluation(np.array([1.0, 3.0]), np.array([5, 5]), 0.1))
         bar.episode(run, 1000, 12.0)
@@ -39,3 +41,8 @@ def test_without_an_expert_nothing_is_compared() -> None:
 def test_a_share_is_said_only_of_positive_returns() -> None:
     assert compared(9.0, 10.0) == "90% of the expert's 10.0"
     assert compared(-9.0, -10.0) == "the expert's -10.0"
+
+
+def test_a_task_is_no_markup_and_no_escape() -> None:
+    text = shown(None, task="[/red]\x1b]0;title\x07")
+    assert "[/red]\\x1b]0;title\\x07 expert" in text and "\x1b]0;" not in text

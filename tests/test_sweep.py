@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fcntl
 import io
 import itertools
@@ -237,6 +238,14 @@ def test_the_table_says_where_every_run_is() -> None:
     assert re.fullmatch(r"1/2 runs ━+.* 62% 0:05:00 left", total)
 
 
+def test_names_in_the_table_are_no_markup() -> None:
+    (job,) = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1]").jobs
+    job.run = dataclasses.replace(job.run, task="[/red]\x1b[2J")
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(sweep.picture([job], speed=0.0, room=2))
+    assert "[/red]\\x1b[2J" in screen.file.getvalue()
+
+
 def test_where_room_is_short_the_running_runs_are_shown() -> None:
     jobs = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1, 2, 3, 4, 5]").jobs
     jobs[3].state = "running"
@@ -420,12 +429,13 @@ def worker(job: plans.Job) -> int:
 
 @contextlib.contextmanager
 def held(jobs: list[plans.Job], process: subprocess.Popen[str]) -> Iterator[None]:
-    """All of them after their third episode: whichever is there first stands still, and none ends before another has begun."""
-    still = {}
+    """All of them after their third episode, or one more than they have: whichever is there first stands still, and none ends
+    before another has begun."""
+    still, wanted = {}, {job.name: max(episodes(job) + 1, 3) for job in jobs}
 
     def arrived() -> bool:
         for job in jobs:
-            if job.name not in still and episodes(job) >= 3:
+            if job.name not in still and episodes(job) >= wanted[job.name]:
                 os.kill(worker(job), signal.SIGSTOP)
                 still[job.name] = worker(job)
         return len(still) == len(jobs)
@@ -435,7 +445,8 @@ def held(jobs: list[plans.Job], process: subprocess.Popen[str]) -> Iterator[None
         yield
     finally:
         for pid in still.values():
-            os.kill(pid, signal.SIGCONT)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
 
 
 def contents(job: plans.Job) -> dict[Path, tuple[int, bytes]]:
@@ -505,6 +516,52 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos:
     assert session.ends()
 
 
+FAILS = """
+import contextlib, stat
+from pathlib import Path
+import psutil
+from pcil import cli, sweep
+
+def children():
+    return [child.name() for child in psutil.Process().children(recursive=True)]
+
+def fail(node, *_, **__):
+    mode = stat.S_IMODE(Path(node.temp_dir).parent.stat().st_mode)
+    print("started", children().count("gcs_server"), f"{mode:o}", node.temp_dir, flush=True)
+    raise Exception("The current node timed out during startup.")
+
+@contextlib.contextmanager
+def folder(private=sweep._private_folder):
+    from ray._private.node import Node  # from now on, for Ray reads its settings when it is imported
+    Node.start_raylet = fail
+    with private() as path:
+        yield path
+
+sweep._private_folder = folder
+print("ended", cli.main(["sweep", "sweep.toml", "--out", "out"]), children(), flush=True)
+"""
+
+
+def test_a_ray_that_does_not_come_up_is_ended_and_said(session: Session) -> None:
+    """Its process that runs already is ended before each further attempt, and its folder, which is private, is gone."""
+    Path("sweep.toml").write_text(WHOLE)
+    printed, _ = session.start("-c", FAILS).communicate(timeout=400)
+    started = re.findall(r"^started (.*) 700 (.*)$", printed, re.M)
+    assert [running for running, _ in started] == ["1"] * sweep.STARTS, printed
+    assert printed.endswith("ended 2 []\n")
+    assert printed.count("Ray can't be had at this machine (The current node timed out") == 1 and "Traceback" not in printed
+    assert not any(Path(folder).parent.exists() for _, folder in started)
+
+
+@pytest.mark.parametrize("place", ["/tmp", "/tmp/" + "x" * 90])
+def test_rays_folder_is_private_and_leaves_room_for_its_sockets(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep.tempfile, "gettempdir", lambda: place)
+    with sweep._private_folder() as folder:
+        assert Path(folder).parent.stat().st_mode & 0o777 == 0o700
+        assert len(f"{folder}/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store") <= 103
+    assert not Path(folder).parent.exists()
+
+
 NODES = """
 import sys
 from ray.cluster_utils import Cluster
@@ -549,6 +606,40 @@ def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, 
         finish(job.run, tmp_path / str(job.run.seed))
         same_run(tmp_path / str(job.run.seed), job.folder)
     nodes.communicate("\n", timeout=200)
+    assert session.ends()
+
+
+@pytest.mark.slow
+def test_whatever_is_killed_the_same_command_finishes_everything(demos: str, session: Session, tmp_path: Path) -> None:
+    """A worker, then the sweep itself, then every process at once, as when the machine goes down; nothing is left behind."""
+    text = f"{PRODUCT.replace('300', '10000')}[settings]\ndemos = '{demos}'\ncheckpoint_seconds = 0\n"
+    jobs = plan(f"{text}{NARROW.replace('every = 100', 'every = 2000')}").jobs
+    words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]
+
+    process = session.start(*words)
+    with held(jobs, process):
+        killed = worker(jobs[0])
+        os.kill(killed, signal.SIGKILL)
+        until(lambda: worker(jobs[0]) != killed and "Resuming at" in jobs[0].log.read_text(), process)
+        process.kill()
+    process.communicate()
+    assert session.ends(), "Ray and the runs end with the sweep"
+
+    process = session.start(*words)
+    with held(jobs, process):
+        for pid in session.members():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    process.communicate()
+    assert session.ends()
+    assert not any((job.folder / "DONE").exists() for job in jobs)
+
+    process = session.start(*words)
+    printed, _ = process.communicate(timeout=1500)
+    assert process.returncode == 0 and printed.endswith("2 of 2 runs are done.\n"), printed
+    for job in jobs:
+        finish(job.run, tmp_path / str(job.run.seed))
+        same_run(tmp_path / str(job.run.seed), job.folder)
     assert session.ends()
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pcil.errors import InputError
+from pcil.errors import InputError, brief
 
 if TYPE_CHECKING:
     from pcil.config import Run
@@ -138,8 +138,9 @@ def _complaint(box: str) -> str:
     return wrong
 
 
-def at_least(least: int, **options: int) -> None:
-    """`InputError` where the number of an option is below the least that it may be."""
+def within(least: int, most: int, **options: int) -> None:
+    """`InputError` where the number of an option is out of its limits."""
     for name, value in options.items():
-        if value < least:
-            raise InputError(f"--{name} is {value}; it must be at least {least}.")
+        if not least <= value <= most:
+            limit = f"at least {least}" if value < least else f"at most {most:,}"
+            raise InputError(f"--{name} is {brief(value)}; it must be {limit}.")

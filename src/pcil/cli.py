@@ -1,7 +1,6 @@
 """The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
 
 import contextlib
-import errno
 import importlib
 import io
 import json
@@ -11,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pcil import arguments
+from pcil import arguments, errors
 from pcil.errors import InputError, shown
 
 if TYPE_CHECKING:
@@ -29,10 +28,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _command(words)
         sys.stdout.flush()
         return code
-    except InputError as error:
-        sentence = " ".join(str(error).split())  # what a library said may have line breaks
-        print(f"pcil: {shown(sentence.removesuffix('.'))}.", file=sys.stderr)
-        return error.exit_code
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
@@ -41,12 +36,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of the rest at its end
         return 141
-    except OSError as error:
-        if error.filename is None and error.errno != errno.ENOSPC:
+    except Exception as error:
+        if not (said := errors.said(error)):
             raise
-        where = shown(str(error.filename or "standard output"), 500)
-        print(f"pcil: {where} can't be read or written ({error.strerror}).", file=sys.stderr)
-        return 2
+        print(f"pcil: {said[0]}.", file=sys.stderr)
+        return said[1]
 
 
 def _command(words: list[str]) -> int:
@@ -142,8 +136,8 @@ def _evaluate(words: list[str]) -> int:
         from pcil.evaluate import environments_for, playable
         from pcil.evaluate import evaluate as roll_out
 
-        arguments.at_least(1, episodes=episodes)
-        arguments.at_least(0, seed=seed)
+        arguments.within(1, 100_000, episodes=episodes)
+        arguments.within(0, 2**31 - 1, seed=seed)
         policy, env_kwargs = playable(folder, env_kwargs, trust)
         copies = environments_for(policy.task, episodes, env_kwargs, single=single_environment)
         with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
@@ -208,8 +202,8 @@ def _record(words: list[str]) -> int:
         """
         from pcil import demos, envs, evaluate, runs
 
-        arguments.at_least(1, episodes=episodes)
-        arguments.at_least(0, seed=seed)
+        arguments.within(1, 100_000, episodes=episodes)
+        arguments.within(0, 2**31 - 1, seed=seed)
         demos.free_folder(out)
         policy, played = evaluate.playable(folder, env_kwargs, trust)
         least = "" if minimum_return is None else f" --minimum-return {minimum_return:g}"
@@ -222,7 +216,7 @@ def _record(words: list[str]) -> int:
             recorded = demos.record(policy, env, episodes, **asked)
         path = recorded.save(out)
         returns = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}"
-        print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {path}")
+        print(f"{episodes} episodes of {shown(policy.task)}, return {returns}: {shown(str(path))}")
         return 0
 
     return arguments.call("record", record, words)
@@ -242,7 +236,7 @@ def _theory(words: list[str]) -> int:
         """
         from pcil import theory
 
-        arguments.at_least(0, seed=seed)
+        arguments.within(0, 2**31 - 1, seed=seed)
         pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
         figures = theory.measure(pairs)
         drawn = ""
@@ -252,7 +246,7 @@ def _theory(words: list[str]) -> int:
             except ImportError:
                 drawn = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
             else:
-                drawn = f"Figure: {draw(pairs, out or Path())}"
+                drawn = shown(f"Figure: {draw(pairs, out or Path())}")
         print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")
         if json_output and drawn:
             print(drawn, file=sys.stderr)
@@ -286,7 +280,7 @@ def _sweep(words: list[str]) -> int:
         """
         from pcil import files, progress, sweep
 
-        arguments.at_least(1, jobs=1 if jobs is None else jobs)
+        arguments.within(1, 100_000, jobs=1 if jobs is None else jobs)
         return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout), trust)
 
     return arguments.call("sweep", sweep, words)

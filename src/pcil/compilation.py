@@ -25,6 +25,7 @@ def start() -> None:
     """
     import jax
 
+    _check_limits()
     config: Any = jax.config
     failed: list[str] = []
 
@@ -49,6 +50,17 @@ def start() -> None:
         logger.removeFilter(heard)
     if failed and not config.jax_platforms:
         logger.warning("A plugin of JAX does not work here (%s); JAX computes on %s.", failed[0], devices[0].platform)
+
+
+def _check_limits() -> None:
+    """`InputError` where the shell's limits are too low for compiled code, which would end the process without a word."""
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return
+    for limit, least, unit in ((resource.RLIMIT_NOFILE, 64, "ulimit -n"), (resource.RLIMIT_AS, 2**31, "ulimit -v, in bytes")):
+        if 0 <= (given := resource.getrlimit(limit)[0]) < least:
+            raise InputError(f"This process may have too little ({unit}: {given:,}); it must be at least {least:,}.")
 
 
 def use_cache() -> None:

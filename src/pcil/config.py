@@ -104,7 +104,14 @@ class Run:
                 f"{self.agent.batch_size}; make reward.batch_size at most agent.batch_size."
             )
         check_ranges(self, update_every=(1, inf), evaluate_every=(1, inf), evaluate_episodes=(1, inf), replay_steps=(1, inf))
-        check_ranges(self, seed=(0, 2**31 - 1), seed_frames=(0, inf), random_frames=(0, inf), checkpoint_seconds=(0, inf))
+        check_ranges(
+            self,
+            frames=(1, inf),
+            seed=(0, 2**31 - 1),
+            seed_frames=(0, inf),
+            random_frames=(0, inf),
+            checkpoint_seconds=(0, inf),
+        )
 
     @property
     def learner(self) -> Method:

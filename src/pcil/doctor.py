@@ -13,6 +13,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from pcil.errors import shown
+
 Check = tuple[str, Callable[[], str], str, bool]
 """What is checked, how (returns a finding, raises where it fails), what to do then, and whether training needs it."""
 
@@ -28,7 +30,7 @@ def report() -> int:
             found, advice = f"{type(error).__name__}: {error}".splitlines()[0][:90], remedy
             mark = "[red]wrong[/]" if needed else "[yellow]absent[/]"
             broken |= needed
-        table.add_row(mark, name, Text(found), Text(advice))  # brackets, as in .[report], are text and no markup
+        table.add_row(mark, name, Text(shown(found)), Text(advice))  # brackets, as in .[report], are text and no markup
     Console().print(table)
     return int(broken)
 

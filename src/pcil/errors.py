@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import math
 import numbers
@@ -10,6 +11,9 @@ import reprlib
 import types
 import typing
 from typing import Any
+
+WHOLE = 2**53
+"""The largest whole number of a setting; up to it a float holds every one."""
 
 
 class InputError(Exception):
@@ -45,10 +49,30 @@ def shown(text: str, longest: int = 1500) -> str:
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
 
 
+def said(error: Exception) -> tuple[str, int] | None:
+    """The sentence that a command ends with and its exit code; None of an error that only a mistake of ours can raise."""
+    if isinstance(error, InputError):
+        return shown(
+            " ".join(str(error).split()).removesuffix(".")
+        ), error.exit_code  # what a library said may have line breaks
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN) or isinstance(error, MemoryError):
+        scarce = True
+    else:  # what JAX and Python say
+        scarce = any(words in str(error) for words in ("RESOURCE_EXHAUSTED", "bad_alloc", "can't start new thread"))
+    if scarce:
+        reason = shown(" ".join(str(error).split()) or "no memory is left", 300)
+        return f"The system refuses what this needs ({reason}); raise the limits that ulimit -a shows, or ask for less", 1
+    if isinstance(error, OSError) and (error.filename is not None or number == errno.ENOSPC):
+        return f"{shown(str(error.filename or 'standard output'), 500)} can't be read or written ({error.strerror})", 2
+    return None
+
+
 def check_ranges(settings: Any, **ranges: tuple[float | int, float | int]) -> None:
     """Each named field must be a number from the first to the second of its range, or `InputError` says which is not."""
     for name, (low, high) in ranges.items():
         value = getattr(settings, name)
+        high = WHOLE if isinstance(value, int) and math.isinf(high) and value > WHOLE else high
         if not low <= value <= high:  # NaN is in no range
             limits = f"at least {low}" if math.isinf(high) else f"from {low} to {high}"
             raise InputError(f"{type(settings).__name__}.{name} is {value}; it must be {limits}.")

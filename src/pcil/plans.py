@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple
 
 from pcil import arguments, envs, files, runs
 from pcil.config import Run
-from pcil.errors import InputError
+from pcil.errors import InputError, brief
 from pcil.report.load import read_evaluations
 
 PRODUCT: dict[str, Any] = {
@@ -82,8 +81,9 @@ def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
         raise InputError(f"{file} can't be read as TOML ({error}).") from error
     _check(str(file), table, FILE)
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))
-    if plan.cores < 1 or not 0 <= plan.gpus < math.inf:
-        raise InputError(f"{file} gives a run {plan.cores} cores and {plan.gpus} GPUs; it needs at least 1 core and 0 GPUs.")
+    if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
+        given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
+        raise InputError(f"{file} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
     for where, product in _products(str(file), table):
         for name, words in _combinations(where, product):
             if any(job.name == name for job in plan.jobs):

@@ -100,7 +100,7 @@ class Bar:
         self._expert = expert_return
         self._began: tuple[float, int] | None = None
         self._progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.fields[amount]}"),
             TimeElapsedColumn(),
@@ -151,7 +151,7 @@ class Bar:
         return self.signal is not None
 
     def _update(self, run: Run, frames: int, **fields: Any) -> None:
-        name = f"{run.task} {run.method}"
+        name = shown(f"{run.task} {run.method}", 60)
         self._progress.update(self._task, description=name, completed=frames, total=run.frames, **fields)
 
     def _returns(self, total_reward: float) -> str:

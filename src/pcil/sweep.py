@@ -11,6 +11,7 @@ import secrets
 import shlex
 import socket
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from pcil import bench, files
 from pcil.errors import InputError, shown
@@ -100,20 +102,55 @@ def _cluster(plan: Plan, limit: int | None, address: str | None) -> Iterator[Any
             socket.create_connection((host, int(port)), timeout=20).close()  # Ray itself would try for many minutes
         except (OSError, ValueError) as error:
             raise InputError(f"Nothing answers at {address} ({error}); give the HOST:PORT of a Ray cluster's head.") from error
-    for attempts_left in range(0 if address else STARTS - 1, -1, -1):
-        try:
-            with contextlib.chdir(Path.cwd().anchor):  # Ray's workers look there first for every module
-                ray.init(**options, runtime_env={"env_vars": workers}, log_to_driver=False, logging_level=logging.ERROR)
-            break
-        except Exception as error:  # Ray has no one type for an address where no cluster is, or none that takes us
-            if not attempts_left:
-                raise InputError(f"Ray can't be had at {address or 'this machine'} ({str(error).strip()}).") from error
-    try:
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            options["_temp_dir"] = stack.enter_context(_private_folder())
+        for attempts_left in range(0 if address else STARTS - 1, -1, -1):
+            try:
+                with contextlib.ExitStack() as attempt:
+                    attempt.enter_context(_ended(ray))
+                    with contextlib.chdir(Path.cwd().anchor):  # Ray's workers look there first for every module
+                        ray.init(**options, runtime_env={"env_vars": workers}, log_to_driver=False, logging_level=logging.ERROR)
+                    stack.push(attempt.pop_all())
+                break
+            except Exception as error:  # Ray has no one type for an address where no cluster is, or none that takes us
+                if not attempts_left:
+                    reason = [*str(error).strip().splitlines(), ""][0]  # what follows is a traceback
+                    raise InputError(f"Ray can't be had at {address or 'this machine'} ({reason}).") from error
         if not (_room(ray, plan) or (address and limit)):  # with both, a cluster that grows is waited for
             raise InputError(f"Ray has no room for a run of {plan.cores} cores and {plan.gpus} GPUs; lower cores or gpus.")
         yield ray
+
+
+@contextlib.contextmanager
+def _private_folder() -> Iterator[str]:
+    """A new folder for Ray's files below one that no other user can open, for Ray opens its own to all.
+
+    The paths of its sockets, which are 64 bytes longer, have at most 103 bytes on some systems.
+    """
+    place = tempfile.gettempdir()
+    short = os.name == "nt" or len(os.fsencode(place)) <= 20
+    with tempfile.TemporaryDirectory(prefix="pcil-", dir=place if short else "/tmp", ignore_cleanup_errors=True) as folder:
+        yield str(Path(folder) / "r")
+
+
+@contextlib.contextmanager
+def _ended(ray: Any) -> Iterator[None]:
+    """Ends Ray and every process that it has started, also those of a start that failed, of which Ray itself knows nothing."""
+    import psutil  # comes with Ray
+
+    me = psutil.Process()
+    before = me.children(recursive=True)
+    try:
+        yield
     finally:
-        ray.shutdown()
+        started = [process for process in me.children(recursive=True) if process not in before]
+        with contextlib.suppress(Exception):
+            ray.shutdown()
+        for process in started:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+        psutil.wait_procs(started, timeout=10)
 
 
 @contextlib.contextmanager
@@ -196,7 +233,7 @@ def picture(jobs: list[Job], speed: float, room: int) -> Group:
         row += [f"{job.frames:,}/{job.run.frames:,}", f"{job.last_return:.1f}" if job.frames else ""]
         if job.state == "running":
             row += [f"{job.rate:,.0f}", time_left(job.run.frames - job.frames, job.rate)]
-        table.add_row(*row)
+        table.add_row(*(Text(shown(word, 60)) for word in row))
     done, total = sum(min(job.frames, job.run.frames) for job in jobs), sum(job.run.frames for job in jobs)
     count = f"{sum(job.state == 'done' for job in jobs)}/{len(jobs)} runs"
     bar = Table.grid(padding=(0, 1))

@@ -23,7 +23,7 @@ EXPERT_STEPS, AGENT_STEPS = 128, 256
 """As many transitions as the paper's Figure 4 has."""
 NUMBERS = 2**28
 """At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
-_NEVER = 2**62
+_NEVER = 2**53
 
 
 def add(found: Collection, trust: Sequence[str] = ()) -> None:

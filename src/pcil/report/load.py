@@ -99,18 +99,18 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
     """
     points, dots, sources, notes = found = Collection([], [], {}, [])
     folders: dict[Path, Path] = {}
-    shown: dict[tuple[Any, ...], Path] = {}
+    seen: dict[tuple[Any, ...], Path] = {}
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; give run folders, folders that hold some, or files like results/*.csv.")
         try:
             rows = read_points(path) if path.is_file() else []
         except InputError as error:
-            notes.append(left_out(path, error.__cause__))
+            notes.append(f"left out: {shown(str(error), 500)}")
             continue
-        others = {shown.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
+        others = {seen.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
         notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
-        rows = [row for row in rows if shown[type(row), *row[:4]] == path]
+        rows = [row for row in rows if seen[type(row), *row[:4]] == path]
         points += (row for row in rows if isinstance(row, Point))
         dots += (row for row in rows if isinstance(row, Dot))
         folders |= {file.parent.resolve(): file.parent for file in sorted(path.rglob("run.json"))}

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -57,10 +57,10 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
     return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
 
 
-def plan(text: str, out: str = "out") -> plans.Plan:
+def plan(text: str, out: str = "out", trust: Sequence[str] = ()) -> plans.Plan:
     """What a file with this text asks for."""
     Path("sweep.toml").write_text(text)
-    return plans.read(Path("sweep.toml"), Path(out))
+    return plans.read(Path("sweep.toml"), Path(out), trust)
 
 
 ANY_LABEL = sorted(name for name, kind in REWARDS.items() if kind.scope == "step")
@@ -483,10 +483,10 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(demos:
     Path("spy_reward.py").write_text(SPY)
     text = f"{PRODUCT.replace('300', '15000')}[settings]\ndemos = '{demos}'\n{NARROW.replace('every = 100', 'every = 1000')}"
     text += "[[runs]]\nseeds = [3]\nframes = 300\n[[runs]]\nseeds = [1]\nvariants.spy.reward = 'spy_reward:Spy'\n"
-    one, two, done, bad = plan(text).jobs
+    one, two, done, bad = plan(text, trust=["spy_reward"]).jobs
     finish(done.run, done.folder)
     before = contents(done)
-    words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]
+    words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2", "--trust", "spy_reward"]
 
     process = session.start(*words)
     with held([one, two], process):

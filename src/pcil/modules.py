@@ -32,8 +32,8 @@ def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> Non
     for name in (names := list(names)):
         if trust is not None and not any(f"{name}.".startswith(f"{trusted}.") for trusted in trust):
             raise InputError(
-                f"{source} names code of the module {brief(name)}, and a file's code is not run unless you trust it; read it, "
-                f"and give --trust {name} if you do."
+                f"{source} names code of the module {brief(name)}, and what a file names is not run unasked; read that code, "
+                f"and give --trust {name} if you trust it."
             )
     with contextlib.suppress(OSError):  # the present folder may be gone
         if names and (here := os.getcwd()) not in sys.path:

@@ -54,7 +54,7 @@ class Job:
         if (self.folder / "DONE").exists():
             self.state = "done"
         with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-            with (self.folder / "train.jsonl").open("rb") as file:
+            with files.open_regular(self.folder / "train.jsonl") as file:
                 file.seek(max(file.seek(0, os.SEEK_END) - 10_000, 0))
                 last = files.parse_json(file.read().split(b"\n")[-2])
             self.frames, self.rate = last["frames"], last["frames_per_second"]

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,6 +170,30 @@ def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trai
         assert all(np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, states), strict=True))
         got, expected = (rewards_of(settings, states[0], given)[steps] for given in (padded, episode))
         assert np.allclose(got, expected, rtol=1e-4, atol=1e-6) and np.ptp(expected) > 0
+
+
+def test_a_task_reward_of_weight_0_leaves_no_trace(settings: Reward, trained: Any) -> None:
+    """Whatever it is: 0 times NaN would be NaN."""
+    settings = dataclasses.replace(settings, task_weight=0.0)
+    obs, action = jnp.asarray(AGENT.obs[:5][None]), jnp.asarray(AGENT.action[:4][None])
+    got = [
+        label(settings, trained, obs, action, jnp.full((1, 4), true), embed, key=jax.random.key(9)) for true in (0.0, jnp.nan)
+    ]
+    assert np.isfinite(got[0]).all() and np.array_equal(*got)
+
+
+@pytest.mark.parametrize("module", ["pcil", "adversarial"])
+def test_a_penalty_of_weight_0_leaves_no_trace(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"pcil.rewards.{module}.gradient_penalty", lambda *_: jnp.float32(jnp.nan))
+    monkeypatch.setattr("pcil.rewards.pcil.group_info_nce", lambda *_: jnp.float32(jnp.nan))
+    settings: Any = CASES["pcil-stages" if module == "pcil" else "dac"]
+    for weight in (0.0, 1.0):
+        changes = {"penalty": weight} | ({"stage_weight": weight} if module == "pcil" else {})
+        settings = dataclasses.replace(settings, **changes)
+        state = settings.init(DEMOS, embed, key=jax.random.key(0))
+        state, metrics = settings.update(state, rows(EXPERT, 0, 32), rows(AGENT, 0, 32), embed, key=jax.random.key(1))
+        arrays = [*jax.tree.leaves(eqx.filter(state, eqx.is_inexact_array)), *metrics.values()]
+        assert all(np.isfinite(array).all() for array in arrays) == (weight == 0)
 
 
 def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) -> None:

@@ -40,7 +40,7 @@ HEADER = 2**16
 """Bytes of what describes an array or a group; types can be nested in it."""
 MEMORY = 2**34
 """Bytes of address space of the process that reads."""
-PATIENCE_SECONDS, BYTES_A_SECOND = 30.0, 5e6
+PATIENCE_SECONDS, BYTES_A_SECOND = 12.0, 5e6
 """How long a file may take, and how much longer for its size."""
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_LZF, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 """What arrays may be packed with; the library looks for the code of others in folders of the machine."""

@@ -132,7 +132,7 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
             notes.append(f"{source.folder} holds the same run as {first.folder}, which is shown.")
     if not points:
         where = ", ".join(map(str, paths)) or "nothing"
-        reason = f" ({notes[0]})" if notes else ""
+        reason = f" ({notes[0].removesuffix('.')})" if notes else ""
         raise InputError(f"There is no run in {where}{reason}; give folders that pcil train made.")
     dots.sort(key=place)
     for name, seeds in curves(points).items():
@@ -299,6 +299,11 @@ def read_points(path: Path) -> list[Any]:
         table = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_FILE))))
         kind: Any = Dot if table and "silhouette" in table[0] else Point
         parse = {name: _PARSERS[hint] for name, hint in _hints(kind).items()}
+        columns = set(table[0]) if table else set(parse)
+        if wrong := (columns - set(parse)) or (set(parse) - columns - set(kind._field_defaults)):
+            raise ValueError(
+                f"{shown(str(min(wrong, key=str)), 100)} is {'missing' if wrong <= set(parse) else 'no column of it'}"
+            )
         rows = [_checked(kind(**{name: parse[name](value) for name, value in row.items()})) for row in table]
         for runs in curves(row for row in rows if isinstance(row, Dot)).values():
             if any(len({dot.reward is None for dot in run}) < 2 for run in runs):

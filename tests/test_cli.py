@@ -158,7 +158,7 @@ OTHERS = [
     ("report --out new", "There is no run in nothing"),
     ("report nowhere --out new", "nowhere does not exist"),
     ("report run/tensorboard --out new", "There is no run in run/tensorboard; give folders that pcil train made"),
-    ("report run/run.json --out new", "There is no run in run/run.json (left out: run/run.json, "),
+    ("report run/run.json --out new", r"left out: run/run\.json is no file of results"),
     ("report run --out run/run.json/new", "can't be written"),
     ("demos walker_walk", "Unrecognized options: walker_walk"),
     ("bench --preset best", "'best'"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from pcil import envs, seeds
 from pcil.evaluate import playable
-from pcil.report.load import Collection
+from pcil.report.load import Collection, named
 from pcil.seeds import Stream
 
 
@@ -23,7 +23,7 @@ def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
         try:
             made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder, trust)
         except Exception as error:  # whatever OpenGL raises where it does not work
-            refused.append(f"{found.sources[name].folder}, {error}")
+            refused.append(named(found.sources[name].folder, error))
     if refused:
         found.notes.append(f"{len(refused)} of {len(first)} animations are left out: {refused[0]}")
     return made

@@ -12,9 +12,9 @@ import numpy as np
 
 from pcil import compilation, envs, learner, loop, modules, presets, runs, seeds
 from pcil.config import Run
-from pcil.errors import InputError
+from pcil.errors import WHOLE, InputError
 from pcil.report.embedding import project
-from pcil.report.load import Collection, Dot, Point, Source, flat, place
+from pcil.report.load import Collection, Dot, Point, Source, flat, named, place
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.types import Episode
@@ -23,7 +23,6 @@ EXPERT_STEPS, AGENT_STEPS = 128, 256
 """As many transitions as the paper's Figure 4 has."""
 NUMBERS = 2**28
 """At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
-_NEVER = 2**53
 
 
 def add(found: Collection, trust: Sequence[str] = ()) -> None:
@@ -42,7 +41,7 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         try:
             found.dots.extend(transitions(source, last, trust))
         except Exception as error:  # whatever a damaged folder or somebody's environment raises
-            refused.append(f"{source.folder}, {error}")
+            refused.append(named(source.folder, error))
     found.dots.sort(key=place)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
@@ -70,7 +69,7 @@ def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[D
             raise InputError(f"{source.folder} holds no checkpoint that can be read.")
         rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
         frames = state.counters.frames
-        episode = loop.play(dataclasses.replace(run, update_every=_NEVER), env, envs.spec(env), state)
+        episode = loop.play(dataclasses.replace(run, update_every=WHOLE), env, envs.spec(env), state)
     embed = learner.frozen_embed(run.learner, state.learner.agent)
     seen = []
     for episodes, rows in ((demos.episodes, EXPERT_STEPS), ([episode], AGENT_STEPS)):

@@ -106,7 +106,7 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
         try:
             rows = read_points(path) if path.is_file() else []
         except InputError as error:
-            notes.append(f"left out: {shown(str(error), 500)}")
+            notes.append(left_out(path, error))
             continue
         others = {seen.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
         notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
@@ -147,7 +147,13 @@ def left_out(where: Path, reason: Any) -> str:
     """A note of what is not shown."""
     if isinstance(reason, OSError) and reason.filename:
         reason = f"{Path(reason.filename).name} can't be read ({reason.strerror})"
-    return f"left out: {shown(str(where), 500)}, {shown(str(reason), 500)}"
+    return f"left out: {named(where, reason)}"
+
+
+def named(where: Path, reason: Any) -> str:
+    """A folder and a reason, which may name it already."""
+    folder, text = shown(str(where), 500), shown(str(reason), 500)
+    return text if text.startswith(folder) else f"{folder}, {text}"
 
 
 def place(row: Point | Dot) -> tuple[Any, ...]:

@@ -22,6 +22,7 @@ from pcil.networks import (
     SCALER_RATE,
     Actor,
     Critic,
+    Normalizer,
     Scaler,
     Trunk,
     scaled,
@@ -325,6 +326,18 @@ def test_an_unscaled_trunk_gives_for_plain_observations_what_the_trunk_gives_for
     plain = unscaled(trunk, scaler)
     assert np.allclose(plain(jnp.asarray(obs)), trunk(jnp.asarray(naive, jnp.float32)), atol=2e-3)
     assert np.allclose(jax.tree.map(np.asarray, plain)(obs, np), plain(jnp.asarray(obs)), atol=1e-5)
+
+
+@pytest.mark.parametrize("scaling", [False, True])
+def test_a_trunk_without_its_last_entry_takes_it_for_zero(scaling: bool) -> None:
+    rng = np.random.default_rng(0)
+    trunk = randomised(Trunk.init(5, FEATURES, key=jax.random.key(0)), 0)
+    if scaling:
+        mean, deviation = (jnp.asarray(x, jnp.float32) for x in (rng.normal(size=5), rng.uniform(0.5, 2, size=5)))
+        trunk = dataclasses.replace(trunk, normalizer=Normalizer(mean, deviation))
+    obs = jnp.asarray(rng.normal(size=(6, 4)), jnp.float32)
+    whole = trunk(jnp.concatenate([obs, jnp.zeros((6, 1))], axis=1))
+    np.testing.assert_allclose(trunk.without_last()(obs), whole, atol=1e-6)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e6, -3e-5])

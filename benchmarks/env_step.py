@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from pcil.bench.environment import measure_env
 from pcil.envs import TASKS
-from pcil.envs.timing import measure_env
 
 
 def main() -> None:

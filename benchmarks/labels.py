@@ -17,10 +17,11 @@ bench.use_one_thread()
 import jax
 import numpy as np
 
-from pcil import envs, learner, presets
+from pcil import envs
 from pcil.demos import Demonstrations
-from pcil.replay import Replay
 from pcil.rewards import states_read
+from pcil.training import learner, presets
+from pcil.training.replay import Replay
 from pcil.types import Batch
 
 CASES: tuple[tuple[str, dict[str, Any]], ...] = (

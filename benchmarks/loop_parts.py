@@ -11,7 +11,9 @@ from pcil import bench
 
 bench.use_one_thread()
 
-from pcil import envs, learner, loop, networks, presets, replay
+from pcil import envs
+from pcil.nets import networks
+from pcil.training import learner, loop, presets, replay
 
 
 def main(task: str = "walker_walk") -> None:

@@ -8,8 +8,9 @@ from pcil import bench
 
 bench.use_one_thread()
 
-from pcil import envs, presets
-from pcil.replay import Replay
+from pcil import envs
+from pcil.training import presets
+from pcil.training.replay import Replay
 
 
 def main(tasks: list[str]) -> None:

@@ -8,7 +8,8 @@ from pcil import bench
 
 bench.use_one_thread()
 
-from pcil import envs, presets
+from pcil import envs
+from pcil.training import presets
 
 
 def main(task: str = "walker_walk") -> None:

@@ -60,8 +60,9 @@ def _reward_options(text: str) -> str:
 
 def page() -> str:
     """The whole of cli.md."""
-    from pcil.cli import COMMANDS
     from pcil.presets import METHODS
+
+    from pcil.cli import COMMANDS
 
     parts = [INTRODUCTION, _block(help_of())]
     for command in COMMANDS:

@@ -4,9 +4,9 @@ import json
 import sys
 from pathlib import Path
 
-from pcil import presets
 from pcil.report.load import flat, place, read_run, write_points
 from pcil.report.variants import NO_VARIANT
+from pcil.training import presets
 
 
 def main(target: str, *folders: str) -> None:

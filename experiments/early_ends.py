@@ -13,7 +13,7 @@ import numpy as np
 import pcil
 from pcil import demos
 from pcil.envs.toy import Reach
-from pcil.evaluate import environments_for, evaluate
+from pcil.training.evaluate import environments_for, evaluate
 
 FOLDER = Path("runs/early_ends")
 METHODS, SEEDS, FRAMES, STARTS = ("pcil", "dac"), (1, 2, 3), 10_000, 50

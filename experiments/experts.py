@@ -14,10 +14,11 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from pcil import demos, envs, runs
+from pcil import demos, envs
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
 from pcil.report.load import read_run, write_points
+from pcil.training import runs
 
 HERE = Path(__file__).parent
 RUNS = Path("runs/experts")

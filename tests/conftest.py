@@ -16,8 +16,8 @@ install_import_hook("pcil", "beartype.beartype")
 import jax
 import pytest
 
-from pcil import hdf5
 from pcil.compilation import use_cache
+from pcil.demos import hdf5
 from pcil.envs import dmc
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -336,9 +336,9 @@ def main() -> int:
         "matplotlib.pyplot",
         "sklearn",
         "jinja2",
-        "pcil.runs",
+        "pcil.training.runs",
         "pcil.report.page",
-        "pcil.film",
+        "pcil.report.film",
     ]:
         importlib.import_module(heavy)  # so that no child has to; JAX's devices start in the child
     ended: collections.Counter[str] = collections.Counter()

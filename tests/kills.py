@@ -90,8 +90,8 @@ def session(method: str, demos: str, folder: Path, every: float, room: int | Non
         with open(folder.with_suffix(".said"), "a") as said:
             os.dup2(said.fileno(), 1)
             os.dup2(said.fileno(), 2)
-        from pcil import runs
         from pcil.errors import InputError
+        from pcil.training import runs
         from small import small_run
 
         if room:
@@ -133,7 +133,7 @@ def differences(whole: Path, folder: Path) -> Iterator[str]:
     """What differs between a run that was left alone and one that was not, wall-clock times left out."""
     import numpy as np
 
-    from pcil import checkpoint
+    from pcil.training import checkpoint
     from test_loop import rows
     from test_metrics import points
 
@@ -153,7 +153,7 @@ def differences(whole: Path, folder: Path) -> Iterator[str]:
 
 def main() -> int:
     sys.path.insert(0, str(Path(__file__).parent))
-    from pcil import presets
+    from pcil.training import presets
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("methods", nargs="*", help=f"by default all: {', '.join(presets.METHODS)}")
@@ -163,7 +163,7 @@ def main() -> int:
     if unknown := set(options.methods) - set(presets.METHODS):
         parser.error(f"there is no method {', '.join(sorted(unknown))}")
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-    for heavy in ("jax", "equinox", "optax", "gymnasium", "minari", "safetensors.numpy", "pytest", "pcil.runs"):
+    for heavy in ("jax", "equinox", "optax", "gymnasium", "minari", "safetensors.numpy", "pytest", "pcil.training.runs"):
         importlib.import_module(heavy)  # so that no child has to; JAX's devices start in the child
     rng, methods = random.Random(options.seed), options.methods or list(presets.METHODS)
     kinds: collections.Counter[str] = collections.Counter()

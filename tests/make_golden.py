@@ -26,11 +26,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from pcil import checkpoint, learner, loop, presets
 from pcil.agents import BC, DrQV2
 from pcil.compilation import use_cache
-from pcil.config import Run
 from pcil.rewards import REWARDS
+from pcil.training import checkpoint, learner, loop, presets
+from pcil.training.config import Run
 from pcil.types import Episode, Spec
 from small import POINT_MASS, narrow, small_run
 
@@ -110,7 +110,7 @@ def five_updates(run: Run) -> dict[str, Any]:
 
 
 def defaults() -> dict[str, Any]:
-    """Every setting's default, by class: what a `run.json` of before the setting was there means (`pcil.config:Run.plain`)."""
+    """Every setting's default, by class: what a `run.json` of before it was there means (`pcil.training.config:Run.plain`)."""
     kinds = dict.fromkeys([DrQV2, BC, *REWARDS.values()])
     return {kind.__name__: dataclasses.asdict(kind()) for kind in kinds}
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pcil import demos, envs, presets
-from pcil.config import Run
+from pcil import demos, envs
 from pcil.envs.toy import PointMass
-from pcil.noise import LinearSchedule
+from pcil.nets.noise import LinearSchedule
+from pcil.training import presets
+from pcil.training.config import Run
 from pcil.types import Batch, Window
 
 POINT_MASS = "toy/point_mass-v0"

@@ -18,15 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import demos, envs, loop, presets, runs
+from pcil import demos, envs
 from pcil.agents import BC, DrQV2
-from pcil.config import changed
 from pcil.demos import Demonstrations
 from pcil.envs.toy import Reach
 from pcil.errors import InputError
 from pcil.policy import Policy
-from pcil.replay import Replay
 from pcil.rewards import Reward
+from pcil.training import loop, presets, runs
+from pcil.training.config import changed
+from pcil.training.replay import Replay
 from pcil.types import Episode
 from small import POINT_MASS, narrow, save_point_mass_demos, small_run
 

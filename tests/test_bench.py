@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 
-from pcil import bench, learner, presets
-from pcil.config import Run
+from pcil import bench
 from pcil.envs.toy import PointMass
+from pcil.training import learner, presets
+from pcil.training.config import Run
 from pcil.types import Batch, Spec, Window
 from small import small_run
 

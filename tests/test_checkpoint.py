@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import checkpoint
 from pcil.errors import InputError
-from pcil.networks import MLP
+from pcil.nets.networks import MLP
+from pcil.training import checkpoint
 
 
 class Learned(eqx.Module):

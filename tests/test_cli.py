@@ -20,12 +20,14 @@ import numpy as np
 import pytest
 
 import pcil
-from pcil import arguments, cli, presets
-from pcil.config import changed
+from pcil import cli
+from pcil.cli import arguments
 from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
 from pcil.envs.toy import PointMass
 from pcil.policy import load_policy
+from pcil.training import presets
+from pcil.training.config import changed
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
-from pcil import presets
 from pcil.agents import DrQV2
-from pcil.config import Run, completed, differences
 from pcil.envs import TASKS
 from pcil.errors import InputError, check_kinds
 from pcil.rewards import PCIL, REWARDS, TaskReward
+from pcil.training import presets
+from pcil.training.config import Run, completed, differences
 
 EVERY_RUN = sorted(presets.METHOD_SETTINGS)
 

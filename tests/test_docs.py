@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import checkpoint, learner, presets
 from pcil.agents import BC, DrQV2
 from pcil.cli import COMMANDS
-from pcil.config import Run
 from pcil.rewards import REWARDS, Reward, TaskReward
+from pcil.training import checkpoint, learner, presets
+from pcil.training.config import Run
 from pcil.types import Episode, Spec
 from small import narrow, random_batch, small_run, windows
 

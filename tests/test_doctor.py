@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pcil import cli, doctor
+from pcil import cli
+from pcil.cli import doctor
 
 
 def broken() -> str:
@@ -34,7 +35,7 @@ def test_only_what_training_needs_fails(
     """What was raised and the remedy are shown as they are: brackets are no markup."""
     checks = (("well", lambda: "found it", "-", True), ("ill", broken, "pip install '.[report]' in a clone", needed))
     monkeypatch.setattr(doctor, "CHECKS", checks)
-    assert doctor.report() == code
+    assert doctor.doctor() == code
     out = capsys.readouterr().out
     assert "ok" in out and "found it" in out
     assert mark in out and "RuntimeError: it is [/bold] gone" in out and "two lines" not in out

@@ -8,8 +8,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from pcil.evaluate import LOCKSTEP, Evaluation, environments_for, evaluate
 from pcil.seeds import Stream, episode_seed
+from pcil.training.evaluate import LOCKSTEP, Evaluation, environments_for, evaluate
 
 
 class Walk(gymnasium.Env[np.ndarray, np.ndarray]):

@@ -18,10 +18,11 @@ import pytest
 
 import pcil
 from odd import Odd, raising
-from pcil import checkpoint, cli, demos, envs, learner, loop, presets, runs
+from pcil import cli, demos, envs
 from pcil.agents import DrQV2
-from pcil.config import Run
 from pcil.errors import InputError, RunError, check_kinds
+from pcil.training import checkpoint, learner, loop, presets, runs
+from pcil.training.config import Run
 from pcil.types import Spec
 from small import random_batch, small_run, windows
 from test_loop import StopAfter, finish, rows, same_run

@@ -17,8 +17,9 @@ import pytest
 
 import pcil
 from fake_runs import fake_run
-from pcil import cli, files, loop, runs
+from pcil import cli, files
 from pcil.errors import InputError, shown
+from pcil.training import loop, runs
 from small import save_point_mass_demos, small_run
 
 HOLD = "import sys, time; from pathlib import Path; from pcil import files\nwith files.locked(Path(sys.argv[1])) as free:\n"
@@ -36,7 +37,7 @@ import importlib, pkgutil, pcil
 for module in pkgutil.walk_packages(pcil.__path__, "pcil."):
     if not module.name.endswith("__main__"):
         importlib.import_module(module.name)
-from pcil.progress import Signals
+from pcil.training.progress import Signals
 with Signals(lambda: None):
     pass
 print("all")

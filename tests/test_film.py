@@ -14,9 +14,9 @@ import pytest
 from PIL import Image
 
 from fake_runs import fake_run
-from pcil import film
-from pcil.networks import Actor
+from pcil.nets.networks import Actor
 from pcil.policy import Policy
+from pcil.report import film
 from pcil.report.load import collect
 
 

@@ -17,13 +17,14 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pcil.fit
-from pcil import checkpoint, demos, envs, loop, presets, runs
-from pcil.config import Run
+import pcil.training.fit
+from pcil import demos, envs
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, json_object
 from pcil.policy import load_policy
 from pcil.rewards import REWARDS
+from pcil.training import checkpoint, loop, presets, runs
+from pcil.training.config import Run
 from pcil.types import Episode, Origin
 from small import POINT_MASS, save_point_mass_demos, small_run
 from test_demos import edit_metadata, forget_checksum, refusal
@@ -108,7 +109,7 @@ def test_kept_actions_have_the_value_that_was_recorded(
     """Boxes are (middle, half the width)."""
     origin, here = (Origin(action_low=[m - h], action_high=[m + h]) for m, h in (theirs, ours))
     episode = Episode(np.zeros((2, 1), np.float32), np.full((1, 1), unit, np.float32), np.zeros(1))
-    (kept,) = pcil.fit._kept(Demonstrations("x", (episode,), {}, origin), here).episodes
+    (kept,) = pcil.training.fit._kept(Demonstrations("x", (episode,), {}, origin), here).episodes
     value = theirs[0] + theirs[1] * float(np.float32(unit))
     assert np.isclose(ours[0] + ours[1] * float(kept.action[0, 0]), value, atol=1e-5)
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import make_golden
-from pcil import learner, presets
-from pcil.config import Method, Run
+from pcil.training import learner, presets
+from pcil.training.config import Method, Run
 from pcil.types import Batch, Spec, Window
 from small import random_batch, windows
 

@@ -20,12 +20,13 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 import pcil
-from pcil import cli, envs, hdf5, modules, representation
-from pcil.demos import Demonstrations
+from pcil import cli, envs, modules
+from pcil.demos import Demonstrations, hdf5
 from pcil.errors import InputError
-from pcil.film import film
-from pcil.networks import Actor
+from pcil.nets.networks import Actor
 from pcil.policy import Policy, load_policy
+from pcil.report import representation
+from pcil.report.film import film
 from pcil.report.load import Point, Source
 from small import POINT_MASS, save_point_mass_demos, small_run
 

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import envs, learner, loop, runs, seeds
+from pcil import envs, seeds
 from pcil.agents import Agent
-from pcil.config import Method, Run
-from pcil.learner import Learner
-from pcil.networks import Actor, Trunk
+from pcil.nets.networks import Actor, Trunk
 from pcil.rewards import Reward
 from pcil.seeds import Stream
+from pcil.training import learner, loop, runs
+from pcil.training.config import Method, Run
+from pcil.training.learner import Learner
 from pcil.types import Episode, Spec, Window
 from small import POINT_MASS, random_batch, small_run, windows
 

@@ -10,12 +10,12 @@ from typing import Any
 import jax.numpy as jnp
 import pytest
 
-from pcil import presets
 from pcil.agents import BC, DrQV2
 from pcil.agents.base import Agent
 from pcil.errors import InputError
-from pcil.noise import LinearSchedule
+from pcil.nets.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN
+from pcil.training import presets
 
 LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
     LinearSchedule(): {"start": (0, inf), "end": (0, inf), "steps": (0, inf)},

@@ -18,11 +18,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from pcil import checkpoint, envs, learner, loop, presets, runs
-from pcil.config import Run
+from pcil import envs
 from pcil.errors import InputError
-from pcil.metrics import WALL_CLOCK
 from pcil.policy import load_policy
+from pcil.training import checkpoint, learner, loop, presets, runs
+from pcil.training.config import Run
+from pcil.training.metrics import WALL_CLOCK
 from pcil.types import Spec
 from small import POINT_MASS, random_batch, save_point_mass_demos, small_run, windows
 

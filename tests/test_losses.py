@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Array, Float
 
-from pcil import losses
+from pcil.nets import losses
 
 law = settings(deadline=None, derandomize=True, max_examples=30)
 info_nce = jax.jit(losses.info_nce, static_argnums=3)

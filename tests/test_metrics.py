@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcil.evaluate import Evaluation
-from pcil.metrics import EVAL_COLUMNS, WALL_CLOCK, MetricWriter, pearson
 from pcil.report.load import read_evaluations
+from pcil.training.evaluate import Evaluation
+from pcil.training.metrics import EVAL_COLUMNS, WALL_CLOCK, MetricWriter, pearson
 
 law = settings(deadline=None, derandomize=True, max_examples=20)
 NAMES = ("eval.csv", "train.jsonl")

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcil.networks import (
+from pcil.nets.networks import (
     LAYER_NORM_EPSILON,
     MLP,
     SCALED_BOUND,
@@ -29,8 +29,8 @@ from pcil.networks import (
     unit_sphere,
     unscaled,
 )
-from pcil.noise import ACTION_MARGIN, LinearSchedule, normal_steps, perturb
-from pcil.optimiser import adam_init, adam_step
+from pcil.nets.noise import ACTION_MARGIN, LinearSchedule, normal_steps, perturb
+from pcil.nets.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=50)
 scaler_update = jax.jit(Scaler.update)

@@ -16,7 +16,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from pcil.errors import InputError
-from pcil.networks import Actor
+from pcil.nets.networks import Actor
 from pcil.policy import Policy, load_policy
 from pcil.types import Spec
 

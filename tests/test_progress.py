@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from pcil.evaluate import Evaluation
-from pcil.progress import Bar, compared
+from pcil.training.evaluate import Evaluation
+from pcil.training.progress import Bar, compared
 from small import small_run
 
 

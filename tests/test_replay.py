@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.stats import chisquare
 
 from pcil.errors import InputError
-from pcil.replay import Replay
+from pcil.training.replay import Replay
 from pcil.types import Episode, Window
 
 law = settings(deadline=None, derandomize=True, max_examples=60)

@@ -15,12 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import learner, representation, runs, seeds
-from pcil.config import Run
+from pcil import seeds
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
+from pcil.report import representation
 from pcil.report.load import Collection, collect, flat
 from pcil.rewards import DAC, PCIL
+from pcil.training import learner, runs
+from pcil.training.config import Run
 from pcil.types import Episode
 from small import narrow, random_batch, save_point_mass_demos, small_run
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 import pcil
-from pcil import presets
 from pcil.rewards import REWARDS
+from pcil.training import presets
 
 PACKAGE = Path(pcil.__file__).parent
 ROOT = Path(__file__).parent.parent
@@ -24,22 +24,28 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
     "errors types seeds files modules compilation",
-    "losses transport optimiser networks noise theory hdf5",
-    "envs arrays minari_files demos replay policy rewards agents",
-    "config presets evaluate checkpoint metrics learner state loop fit runs progress",
-    "representation film reporting",
-    "bench doctor arguments plans sweep cli",
+    "nets",
+    "envs demos policy rewards agents",
+    "training",
+    "report theory bench",
+    "sweep cli",
 ]
-"""A part imports from its own layer and those above it in this list; `report` stands aside, for `REPORTERS` alone."""
-REPORTERS = {"plans", "cli", "representation", "film", "reporting"}
-LAYER = {part: depth for depth, parts in enumerate(LAYERS) for part in parts.split()}
+"""A room, or a file beside the rooms, imports from its own layer and those above it in this list."""
+LAYER = {room: depth for depth, rooms in enumerate(LAYERS) for room in rooms.split()}
+ROLLING_OUT = {"representation", "film"}
+"""The files of `report` that load JAX and play episodes."""
 LOADERS = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 """Modules that run code out of a file which they read."""
 
 
-def part(path: Path) -> str:
-    """The module or package directly below `pcil` that a file belongs to."""
+def room(path: Path) -> str:
+    """The room, or the file beside the rooms, that a file is."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def name(path: Path) -> str:
+    """The full name of a file as a module."""
+    return ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -52,55 +58,48 @@ def imported(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def parts_imported(path: Path) -> set[str]:
-    """The parts of the package that a file imports."""
-    return {name.split(".")[1] for name in imported(path) if name.startswith("pcil.")}
+def rooms_imported(path: Path) -> set[str]:
+    """The rooms that a file imports from."""
+    return {word.split(".")[1] for word in imported(path) if word.startswith("pcil.")}
 
 
-PARTS = {part(path) for path in SOURCES} - {"__init__", "__main__", "report"}
+INSIDE = [path for path in SOURCES if room(path) not in ("__init__", "__main__")]
 
 
-def test_every_part_has_its_layer() -> None:
-    assert set(LAYER) == PARTS
+def test_every_room_has_its_layer() -> None:
+    assert set(LAYER) == {room(path) for path in INSIDE}
 
 
-@pytest.mark.parametrize("path", [path for path in SOURCES if part(path) in LAYER], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", INSIDE, ids=name)
 def test_imports_go_one_way(path: Path) -> None:
-    allowed = {name for name, depth in LAYER.items() if depth <= LAYER[part(path)]}
-    if part(path) in REPORTERS:
-        allowed.add("report")
-    assert parts_imported(path) <= allowed
+    assert rooms_imported(path) <= {other for other, depth in LAYER.items() if depth <= LAYER[room(path)]}
 
 
-def test_no_parts_import_each_other_in_a_circle() -> None:
-    graph = {name: set() for name in LAYER}
-    for path in SOURCES:
-        if part(path) in LAYER:
-            graph[part(path)] |= parts_imported(path) - {part(path), "report"}
-    order = list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
-    assert set(order) == set(LAYER) and order.index("errors") < order.index("types") < order.index("loop") < order.index("cli")
+def test_no_files_import_each_other_in_a_circle() -> None:
+    modules = {name(path): path for path in INSIDE}
+    graph = {
+        own: {found for word in imported(path) if (found := word if word in modules else word.rpartition(".")[0]) in modules}
+        for own, path in modules.items()
+    }
+    order = list(graphlib.TopologicalSorter({own: others - {own} for own, others in graph.items()}).static_order())
+    assert order.index("pcil.errors") < order.index("pcil.types") < order.index("pcil.training.loop")
 
 
 def test_agents_and_rewards_know_nothing_of_each_other() -> None:
-    found = {name: set().union(*(parts_imported(path) for path in SOURCES if part(path) == name)) for name in LAYER}
+    found = {own: set().union(*(rooms_imported(path) for path in INSIDE if room(path) == own)) for own in LAYER}
     assert "rewards" not in found["agents"] and "agents" not in found["rewards"]
 
 
 def test_the_report_imports_no_jax() -> None:
     """In a fresh process, so that what its imports import counts too; it takes nothing of the package but the error, the
     readers of files and the theory."""
-    names = [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in SOURCES if part(path) == "report"]
-    code = f"import sys, {', '.join(names)}; print(*sorted(sys.modules))"
+    static = [path for path in SOURCES if room(path) == "report" and path.stem not in ROLLING_OUT]
+    code = f"import sys, {', '.join(map(name, static))}; print(*sorted(sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "pcil.report.page" in loaded and not {"jax", "equinox", "gymnasium", "mujoco", "sklearn"} & set(loaded)
-    assert set().union(*(parts_imported(path) for path in SOURCES if part(path) == "report")) == {
-        "report",
-        "errors",
-        "files",
-        "theory",
-    }
-    lazily = {name for path in SOURCES if part(path) == "report" for name in imported(path)}
-    assert not any(re.match(r"(jax|equinox|optax)\b", name) for name in lazily)
+    assert set().union(*map(rooms_imported, static)) <= {"report", "errors", "files", "theory"}
+    lazily = {word for path in static for word in imported(path)}
+    assert not any(re.match(r"(jax|equinox|optax)\b", word) for word in lazily)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +149,8 @@ def code_words(path: Path) -> Iterator[tuple[int, str]]:
             yield line, token.string.lower()
 
 
-GENERAL = [PACKAGE / name for name in ("loop.py", "learner.py", "evaluate.py", "agents/base.py", "agents/drqv2.py")]
+GENERAL = [PACKAGE / f"training/{file}.py" for file in ("loop", "state", "learner", "evaluate")]
+GENERAL += [PACKAGE / f"agents/{file}.py" for file in ("base", "drqv2")]
 
 
 @pytest.mark.parametrize("path", GENERAL, ids=lambda path: path.stem)

@@ -27,10 +27,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from pcil import checkpoint, cli, loop, plans, runs, sweep
+from pcil import cli, sweep
 from pcil.envs import TASKS
 from pcil.errors import InputError
 from pcil.rewards import REWARDS
+from pcil.sweep import plans
+from pcil.training import checkpoint, loop, runs
 from small import POINT_MASS, save_point_mass_demos, small_run
 from test_loop import StopAfter, finish, same_run
 

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float
 
 from pcil import cli, theory
 from pcil.errors import InputError
-from pcil.losses import info_nce
-from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import adam_init, adam_step
+from pcil.nets.losses import info_nce
+from pcil.nets.networks import MLP, unit_sphere
+from pcil.nets.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=40)
 EXACT = 1e-12
@@ -555,7 +555,7 @@ def test_the_command_prints_a_table_and_draws(tmp_path: Path, capsys: pytest.Cap
 def test_without_matplotlib_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "pcil.report.theory", raising=False)
+    monkeypatch.delitem(sys.modules, "pcil.theory.figure", raising=False)
     monkeypatch.delitem(sys.modules, "pcil.report.figures", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert cli.main(["theory"]) == 0

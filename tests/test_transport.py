@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 
 from pcil.errors import InputError
+from pcil.nets.transport import sinkhorn_plan
 from pcil.rewards import POTIL
-from pcil.transport import sinkhorn_plan
 
 
 def random_cost(rows: int, columns: int, seed: int) -> np.ndarray:

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pcil import learner, presets
-from pcil.config import Method
 from pcil.envs.toy import PointMass
-from pcil.presets import METHODS
+from pcil.training import learner, presets
+from pcil.training.config import Method
+from pcil.training.presets import METHODS
 from pcil.types import Batch, Episode, Spec, Window
 from small import narrow
 

@@ -33,7 +33,7 @@ _HOME = {
     "load_policy": ("pcil.policy", "load_policy"),
     "make_env": ("pcil.envs", "make"),
     "record": ("pcil.demos", "record"),
-    "train": ("pcil.runs", "train"),
+    "train": ("pcil.training.runs", "train"),
 }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pcil import files
 from pcil.errors import InputError
-from pcil.networks import MLP, Actor, Normalizer, Trunk
+from pcil.nets.networks import MLP, Actor, Normalizer, Trunk
 from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"

@@ -11,10 +11,11 @@ import pytest
 import scipy.stats
 from jax.test_util import check_grads
 
-from pcil import envs, loop, presets, runs
+from pcil import envs
 from pcil.agents import BC
-from pcil.config import Run, changed
 from pcil.policy import load_policy
+from pcil.training import loop, presets, runs
+from pcil.training.config import Run, changed
 from pcil.types import Spec
 from small import POINT_MASS, narrow, random_batch, save_point_mass_demos, windows
 

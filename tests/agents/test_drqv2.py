@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from pcil import envs, loop, runs
+from pcil import envs
 from pcil.agents import DrQV2
 from pcil.envs.toy import PointMass
 from pcil.seeds import Stream, episode_seed
+from pcil.training import loop, runs
 from pcil.types import Spec, Window
 from small import narrow, random_batch, small_run
 

@@ -12,8 +12,8 @@ import pytest
 
 from pcil.agents import DrQV2
 from pcil.agents.drqv2 import DrQV2State
-from pcil.networks import MLP, Actor, Trunk
-from pcil.noise import LinearSchedule
+from pcil.nets.networks import MLP, Actor, Trunk
+from pcil.nets.noise import LinearSchedule
 from pcil.types import Spec, Window
 from small import narrow, random_batch
 

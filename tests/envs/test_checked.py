@@ -13,7 +13,7 @@ from gymnasium import spaces
 from odd import Odd, raising
 from pcil import demos, envs
 from pcil.errors import InputError, RunError
-from pcil.evaluate import evaluate
+from pcil.training.evaluate import evaluate
 from pcil.types import Spec
 
 ACTION = np.zeros(1, np.float32)

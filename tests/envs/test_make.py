@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from pcil import cli, envs, runs
+from pcil import cli, envs
+from pcil.bench.environment import measure_env
 from pcil.envs import TASKS, make, register, spec, task_name
-from pcil.envs.timing import measure_env
 from pcil.errors import InputError
+from pcil.training import runs
 from pcil.types import Spec
 from small import small_run
 

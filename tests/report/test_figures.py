@@ -13,9 +13,9 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
-from pcil import presets
 from pcil.report import figures
 from pcil.report.load import Dot, Point
+from pcil.training import presets
 
 EVALUATIONS = """\
 frames,episode,return,length,seconds

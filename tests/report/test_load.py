@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from fake_runs import fake_run, fake_sweep
-from pcil.config import MACHINE_SETTINGS
 from pcil.errors import InputError
 from pcil.report.load import Dot, Point, collect, curves, flat, label, matrix, read_points, read_run, write_points
 from pcil.report.variants import NO_VARIANT
+from pcil.training.config import MACHINE_SETTINGS
 
 
 def make_run(folder: Path) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pcil import theory
-from pcil.report.theory import FAILS, HOLDS, draw
+from pcil.theory.figure import FAILS, HOLDS, draw
 
 PAIRS = [
     theory.Pairs(2, np.array([0.3, 0.6]), np.array([0.4, 0.7]), np.array([0.1, 0.6]), np.zeros(2)),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil.networks import MLP
+from pcil.nets.networks import MLP
 from pcil.rewards.adversarial import DAC, DiscriminatorState
 from small import narrow, random_batch, windows
 

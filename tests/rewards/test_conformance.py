@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pcil import checkpoint, presets
-from pcil.networks import Trunk
+from pcil.nets.networks import Trunk
 from pcil.rewards import REWARDS, Reward, label
+from pcil.training import checkpoint, presets
 from pcil.types import Batch, Window
 from small import narrow, random_batch, windows
 

@@ -12,10 +12,10 @@ import numpy as np
 import optax
 import pytest
 
-from pcil import presets
-from pcil.networks import MLP, unit_sphere
+from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards import PCIL, TCN, Reward
 from pcil.rewards.embedding import Classifier, EmbeddingState, embedding_reward, similarity
+from pcil.training import presets
 from pcil.types import Window
 from small import narrow, random_batch, windows
 

@@ -18,13 +18,13 @@ from hypothesis import strategies as st
 from jax.extend import core
 from jax.test_util import check_grads
 
-from pcil import learner
-from pcil.learner import frozen_embed
-from pcil.losses import gradient_penalty
-from pcil.networks import MLP, unit_sphere
+from pcil.nets.losses import gradient_penalty
+from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards import label
 from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.pcil import PCIL, derangement, stages
+from pcil.training import learner
+from pcil.training.learner import frozen_embed
 from pcil.types import Batch, Spec, Window
 from small import narrow, random_batch, small_run, windows
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pcil.networks import Trunk
+from pcil.nets.networks import Trunk
 from pcil.rewards.pwil import PWIL, PWILState, greedy_distances, move
 from pcil.types import Batch, Window
 from small import random_batch, windows

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pcil import learner
-from pcil.config import Run
-from pcil.networks import MLP, Trunk
+from pcil.nets.networks import MLP, Trunk
 from pcil.rewards.sil import POTIL, SIL, Demos, SinkhornReward, SinkhornState, step_weights
+from pcil.training import learner
+from pcil.training.config import Run
 from pcil.types import Batch, Episode, Spec, Window
 from small import narrow, random_batch, small_run, windows
 

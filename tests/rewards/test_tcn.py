@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from pcil.errors import InputError
-from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import adam_init
+from pcil.nets.networks import MLP, unit_sphere
+from pcil.nets.optimiser import adam_init
 from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.tcn import TCN
 from pcil.types import Window

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.errors import check_kinds, check_ranges
-from pcil.networks import Actor, Trunk
+from pcil.nets.networks import Actor, Trunk
 from pcil.types import Spec, Window
 
 Metrics = dict[str, Float[Array, ""]]

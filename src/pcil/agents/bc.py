@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import InputError, check_ranges
-from pcil.networks import Actor, Scaler, Trunk, scaled, unscaled
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.nets.networks import Actor, Scaler, Trunk, scaled, unscaled
+from pcil.nets.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
 

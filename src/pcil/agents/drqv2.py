@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
-from pcil.losses import n_step_target
-from pcil.networks import Actor, Critic, Scaler, Trunk, scaled, unscaled
-from pcil.noise import LinearSchedule, normal_steps, perturb
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.nets.losses import n_step_target
+from pcil.nets.networks import Actor, Critic, Scaler, Trunk, scaled, unscaled
+from pcil.nets.noise import LinearSchedule, normal_steps, perturb
+from pcil.nets.optimiser import Moments, adam_init, adam_step
 from pcil.types import Spec, Window
 
 

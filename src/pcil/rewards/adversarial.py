@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.losses import binary_cross_entropy, gradient_penalty, interpolate
-from pcil.networks import MLP
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.nets.losses import binary_cross_entropy, gradient_penalty, interpolate
+from pcil.nets.networks import MLP
+from pcil.nets.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.types import Batch, Window
 

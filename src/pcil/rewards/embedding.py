@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pcil.losses import binary_cross_entropy
-from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.nets.losses import binary_cross_entropy
+from pcil.nets.networks import MLP, unit_sphere
+from pcil.nets.optimiser import Moments, adam_init, adam_step
 from pcil.rewards.base import Embed, Metrics
 from pcil.types import Batch
 

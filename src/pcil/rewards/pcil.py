@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.losses import gradient_penalty, group_info_nce, info_nce, interpolate
-from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import adam_count
+from pcil.nets.losses import gradient_penalty, group_info_nce, info_nce, interpolate
+from pcil.nets.networks import MLP, unit_sphere
+from pcil.nets.optimiser import adam_count
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch, Window

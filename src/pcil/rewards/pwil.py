@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.networks import Normalizer, Scaler
+from pcil.nets.networks import Normalizer, Scaler
 from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
 from pcil.types import Batch, Window
 

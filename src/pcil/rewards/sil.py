@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.networks import MLP, unit_sphere
-from pcil.optimiser import Moments, adam_init, adam_step
+from pcil.nets.networks import MLP, unit_sphere
+from pcil.nets.optimiser import Moments, adam_init, adam_step
+from pcil.nets.transport import sinkhorn_plan
 from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
-from pcil.transport import sinkhorn_plan
 from pcil.types import Batch, Window
 
 

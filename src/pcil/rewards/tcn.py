@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from pcil.errors import check_ranges
-from pcil.losses import contrast, off_diagonal
-from pcil.networks import MLP, unit_sphere
+from pcil.nets.losses import contrast, off_diagonal
+from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch, Window

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from pcil.cli import arguments
 from pcil.errors import InputError, shown
 from pcil.files import expanded, room_for
 from pcil.modules import Trust
@@ -36,7 +37,7 @@ def report(
         page.clear(out := expanded(out))
         films: dict[str, bytes] = {}
         if rollouts and found.sources:
-            from pcil import film, representation
+            from pcil.report import film, representation
 
             representation.add(found, trust)
             films = film.films(found, trust)
@@ -45,7 +46,11 @@ def report(
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """`pcil.representation:with_defaults`, which loads JAX: a report of files of results alone does without."""
-    from pcil.representation import with_defaults
+    """`pcil.report.representation:with_defaults`, which loads JAX: a report of files of results alone does without."""
+    from pcil.report.representation import with_defaults
 
     return with_defaults(settings)
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("report", report, words)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pcil.errors import InputError, brief
 
 if TYPE_CHECKING:
-    from pcil.config import Run
+    from pcil.training.config import Run
 
 
 def call(name: str, function: Callable[..., int], words: list[str]) -> int:
@@ -48,8 +48,9 @@ def train(words: list[str], execute: Callable[["Run", Path], int], trust: Sequen
     """
     import tyro
 
-    from pcil import envs, modules, presets
-    from pcil.config import Run
+    from pcil import envs, modules
+    from pcil.training import presets
+    from pcil.training.config import Run
 
     given = peek(words)
     task = envs.task_name(given.get("task", "walker_walk"))

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from typing import Any
 
 from pcil.agents import BC, DrQV2
-from pcil.config import Run, changed
 from pcil.errors import InputError, brief
-from pcil.noise import LinearSchedule
+from pcil.nets.noise import LinearSchedule
 from pcil.rewards import DAC, PCIL, POTIL, PWIL, SIL, TCN, TaskReward
+from pcil.training.config import Run, changed
 
 
 def paper(task: str) -> dict[str, Any]:

@@ -41,8 +41,9 @@ def use_one_thread() -> None:
 def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
     use_one_thread()
-    from pcil import compilation, envs, modules, presets
-    from pcil.envs.timing import measure_env
+    from pcil import compilation, envs, modules
+    from pcil.bench.environment import measure_env
+    from pcil.training import presets
 
     compilation.start()
     timing = measure_env(task)
@@ -88,9 +89,9 @@ class Setup:
         import jax
         import numpy as np
 
-        from pcil import learner
-        from pcil.learner import on_host
-        from pcil.replay import Replay
+        from pcil.training import learner
+        from pcil.training.learner import on_host
+        from pcil.training.replay import Replay
         from pcil.types import Batch, Episode
 
         rng = np.random.default_rng(0)
@@ -120,7 +121,7 @@ class Setup:
         import jax
         import numpy as np
 
-        from pcil import learner
+        from pcil.training import learner
 
         for _ in range(times):
             step, self.count = np.int32(self.count), self.count + 1
@@ -197,7 +198,7 @@ def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str
 
 def loop_share(run: Any, seconds: float) -> tuple[float, float]:
     """Share of a real loop's time that is spent in the update, and frames a second."""
-    from pcil import learner
+    from pcil.training import learner
 
     timing = time_loop(run, seconds, [(learner, "update")])
     return timing.inside["update"] / timing.seconds, timing.frames / timing.seconds
@@ -221,7 +222,7 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
     """
     import jax
 
-    from pcil import loop, runs
+    from pcil.training import loop, runs
 
     names = [name for _, name in parts]
     inside, calls = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)

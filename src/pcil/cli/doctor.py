@@ -13,14 +13,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from pcil.cli import arguments
 from pcil.errors import shown
 
 Check = tuple[str, Callable[[], str], str, bool]
 """What is checked, how (returns a finding, raises where it fails), what to do then, and whether training needs it."""
 
 
-def report() -> int:
-    """Print one row a check; 1 where something that training needs is missing."""
+def doctor() -> int:
+    """Say what is installed, what is wrong, and what to do; exit code 1 where training can't work."""
     table = Table("", "part", "found", "what to do")
     broken = False
     for name, look, remedy, needed in CHECKS:
@@ -129,3 +130,7 @@ CHECKS: tuple[Check, ...] = (
     ("sweeps", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
     ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
 )
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("doctor", doctor, words)

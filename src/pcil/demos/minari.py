@@ -42,7 +42,7 @@ def read(data: Path, *, trusted: bool = False) -> Stored:
     Actions or rewards are absent where no episode has any: the file lacks them, or all of them are NaN. Minari's own reader is
     not used: it follows a damaged or foreign file to other files, into crashes, and to whatever environment the file names.
     """
-    from pcil import hdf5
+    from pcil.demos import hdf5
 
     where, episodes = str(data), []
     try:

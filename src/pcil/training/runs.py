@@ -17,13 +17,14 @@ from typing import Any
 
 import gymnasium
 
-from pcil import compilation, envs, files, fit, loop, presets, progress, state
-from pcil.config import Run, changed, completed, differences
+from pcil import compilation, envs, files
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError, brief
-from pcil.evaluate import Evaluation
-from pcil.metrics import LOGS
 from pcil.policy import Policy, load_policy
+from pcil.training import fit, loop, presets, progress, state
+from pcil.training.config import Run, changed, completed, differences
+from pcil.training.evaluate import Evaluation
+from pcil.training.metrics import LOGS
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
@@ -288,13 +289,13 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
 
 def commit() -> str | None:
     """The commit of the source tree that is running, with "+" where files differ from it; None outside a repository."""
-    here = Path(__file__).parent
+    here = Path(__file__).parent.parent
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        if not git("ls-files", "runs.py"):
+        if not git("ls-files", "__init__.py"):
             return None
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", ".") else "")
     except (OSError, subprocess.CalledProcessError):

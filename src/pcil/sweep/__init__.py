@@ -26,8 +26,8 @@ from rich.text import Text
 
 from pcil import bench, files
 from pcil.errors import InputError, shown
-from pcil.plans import Job, Plan, read
-from pcil.progress import Signals, time_left
+from pcil.sweep.plans import Job, Plan, read
+from pcil.training.progress import Signals, time_left
 
 STARTS = 3
 """How often a cluster of our own is tried to start: Ray gives its parts 15 seconds, which may be too few on a busy machine."""

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from pcil.config import Run
 from pcil.errors import shown
-from pcil.evaluate import Evaluation
+from pcil.training.config import Run
+from pcil.training.evaluate import Evaluation
 
 
 class _TimeLeft(ProgressColumn):

@@ -14,9 +14,9 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator, registry
 
 from pcil import envs
-from pcil.config import Run
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
+from pcil.training.config import Run
 from pcil.types import Origin
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from pcil import envs, seeds
-from pcil.evaluate import playable
 from pcil.report.load import Collection, named
 from pcil.seeds import Stream
+from pcil.training.evaluate import playable
 
 
 def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil import seeds
-from pcil.config import Method
-from pcil.networks import Actor, Trunk
+from pcil.nets.networks import Actor, Trunk
 from pcil.rewards import Reward, label, states_read
 from pcil.seeds import Stream
+from pcil.training.config import Method
 from pcil.types import Batch, Episode, Spec, Window
 
 UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch", "actor": "the actor's parameters"}

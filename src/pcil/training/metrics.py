@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pcil.evaluate import Evaluation
+from pcil.training.evaluate import Evaluation
 from pcil.types import Episode
 
 LOGS = ("eval.csv", "train.jsonl")

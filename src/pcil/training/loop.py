@@ -12,17 +12,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import envs, learner, seeds
-from pcil.config import Run
+from pcil import envs, seeds
 from pcil.errors import InputError, RunError
-from pcil.evaluate import Evaluation, environments_for, evaluate
-from pcil.learner import Learner, on_host
-from pcil.metrics import Clock, MetricWriter, described
-from pcil.networks import Actor
+from pcil.nets.networks import Actor
 from pcil.policy import Policy
-from pcil.replay import Replay
 from pcil.seeds import Stream
-from pcil.state import Counters, State, absorbed, resume, save, start
+from pcil.training import learner
+from pcil.training.config import Run
+from pcil.training.evaluate import Evaluation, environments_for, evaluate
+from pcil.training.learner import Learner, on_host
+from pcil.training.metrics import Clock, MetricWriter, described
+from pcil.training.replay import Replay
+from pcil.training.state import Counters, State, absorbed, resume, save, start
 from pcil.types import Episode, Spec
 
 OFFLINE_STEPS = 500

@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import compilation, envs, learner, loop, modules, presets, runs, seeds
-from pcil.config import Run
+from pcil import compilation, envs, modules, seeds
 from pcil.errors import WHOLE, InputError
 from pcil.report.embedding import project
 from pcil.report.load import Collection, Dot, Point, Source, flat, named, place
 from pcil.rewards import Reward
 from pcil.seeds import Stream
+from pcil.training import learner, loop, presets, runs
+from pcil.training.config import Run
 from pcil.types import Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256

@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pcil import envs, files, seeds
-from pcil.arrays import episodes_of
+from pcil.demos.arrays import episodes_of
+from pcil.demos.minari import Stored, read, reason, task_of, write
 from pcil.errors import InputError, brief
-from pcil.minari_files import Stored, read, reason, task_of, write
 from pcil.types import Episode, Origin, Spec
 
-SHIPPED = Path(__file__).parent / "data" / "demos"  # a Minari root, so that plain Minari can load what ships
+SHIPPED = Path(__file__).parent.parent / "data" / "demos"  # a Minari root, so that plain Minari can load what ships
 ACTION_TOLERANCE = 1e-6  # how far rounding may carry an action out of [-1, 1]
 ATTEMPTS_PER_EPISODE = 10  # `record` gives up after so many rollouts for each episode that was asked for
 

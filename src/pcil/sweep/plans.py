@@ -12,10 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pcil import arguments, envs, files, runs
-from pcil.config import Run
+from pcil import envs, files
+from pcil.cli import arguments
 from pcil.errors import InputError, brief
 from pcil.report.load import read_evaluations
+from pcil.training import runs
+from pcil.training.config import Run
 
 PRODUCT: dict[str, Any] = {
     "tasks": ["walker_walk"],

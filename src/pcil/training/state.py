@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil import checkpoint, learner
-from pcil.config import Run
 from pcil.errors import InputError
-from pcil.learner import Learner
-from pcil.metrics import LOGS, Clock
-from pcil.networks import Actor
+from pcil.nets.networks import Actor
 from pcil.policy import load_policy
-from pcil.replay import Replay
 from pcil.rewards import states_read
+from pcil.training import checkpoint, learner
+from pcil.training.config import Run
+from pcil.training.learner import Learner
+from pcil.training.metrics import LOGS, Clock
+from pcil.training.replay import Replay
 from pcil.types import Batch, Episode, Spec
 
 

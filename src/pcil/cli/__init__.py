@@ -1,0 +1,67 @@
+"""The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
+
+import importlib
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+from pcil import errors
+from pcil.errors import InputError
+
+COMMANDS = {
+    "train": "Train a policy, or resume where a run stopped.",
+    "evaluate": "Roll out the policy of a run, without exploration.",
+    "demos": "List the demonstrations that ship.",
+    "record": "Record demonstrations from a trained policy.",
+    "theory": "Check the paper's Theorem 1 numerically, and draw it.",
+    "report": "Draw figures, tables and a page from runs.",
+    "sweep": "Train every run of a file, side by side.",
+    "bench": "Measure the speed of each part, and its ratio to the floor.",
+    "doctor": "Say what is installed, what is wrong, and what to do.",
+}
+"""Each is a file of this folder, with a `main` that is given its words."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; 0 on success, 2 on bad input, 1 where a run failed, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
+    # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that can't show every letter
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        code = _command(words)
+        sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
+        print(f"pcil: stopped{again}.", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of the rest at its end
+        return 141
+    except Exception as error:
+        if not (said := errors.said(error)):
+            raise
+        print(f"pcil: {said[0]}.", file=sys.stderr)
+        return said[1]
+
+
+def _command(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    if words[0] == "--version":
+        print(f"pcil {importlib.import_module('pcil').__version__}")
+        return 0
+    if words[0] not in COMMANDS:
+        raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
+    return importlib.import_module(f"pcil.cli.{words[0]}").main(words[1:])
+
+
+def _overview() -> str:
+    lines = ["usage: pcil COMMAND ...", "", "Policies from demonstrations.", "", "commands:"]
+    lines += [f"  {name:<10}{summary}" for name, summary in COMMANDS.items()]
+    return "\n".join([*lines, "", "pcil COMMAND --help tells more; pcil --version prints the version."])

@@ -1,0 +1,36 @@
+"""`pcil bench`."""
+
+import json
+from typing import Annotated
+
+import tyro
+
+from pcil.cli import arguments
+from pcil.errors import InputError
+
+
+def bench(
+    task: str = "walker_walk",
+    preset: str = "default",
+    seconds: float = 20.0,
+    json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Measure the speed of each part, and its ratio to the floor, on one thread.
+
+    Args:
+        task: The environment, and the sizes of its networks.
+        preset: Settings of PCIL whose update is measured.
+        seconds: About how long to measure.
+        json_output: Print one JSON object and nothing else.
+    """
+    from pcil import bench
+
+    if not 0 < seconds < 86_400:
+        raise InputError(f"--seconds is {seconds}; it must be above 0 and below a day.")
+    figures = bench.measure(task, preset, seconds)
+    print(json.dumps(figures) if json_output else bench.table(figures))
+    return 0
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("bench", bench, words)

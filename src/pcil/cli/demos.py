@@ -1,0 +1,25 @@
+"""`pcil demos`."""
+
+import json
+from typing import Annotated
+
+import tyro
+
+from pcil.cli import arguments
+
+
+def demos(json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """List the demonstrations that ship.
+
+    Args:
+        json_output: Print one JSON list and nothing else.
+    """
+    from pcil.demos import shipped, table
+
+    rows = shipped()
+    print(json.dumps(rows) if json_output else "\n".join(table(rows)))
+    return 0
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("demos", demos, words)

@@ -1,0 +1,59 @@
+"""`pcil evaluate`."""
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pcil.cli import arguments
+from pcil.errors import shown
+from pcil.modules import Trust
+from pcil.training.config import EnvKwargs
+
+
+def evaluate(
+    folder: Path,
+    /,
+    episodes: int = 10,
+    seed: int = 0,
+    env_kwargs: EnvKwargs | None = None,
+    single_environment: bool = False,
+    trust: Trust = (),
+    json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """Roll out the policy of a run, without exploration.
+
+    Args:
+        folder: A run's folder, or one that holds policy.json and policy.safetensors.
+        episodes: How many.
+        seed: The episodes' starts follow from it.
+        env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
+        single_environment: Play one episode after the other in one environment: slower, with the same results.
+        trust: Modules that the policy's files may name, whose code is then run, such as my.module.
+        json_output: Print one JSON object and nothing else.
+    """
+    from pcil.training.evaluate import environments_for, playable
+    from pcil.training.evaluate import evaluate as roll_out
+
+    arguments.within(1, 100_000, episodes=episodes)
+    arguments.within(0, 2**31 - 1, seed=seed)
+    policy, env_kwargs = playable(folder, env_kwargs, trust)
+    copies = environments_for(policy.task, episodes, env_kwargs, single=single_environment)
+    with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
+        policy.check_fits(made[0])
+        result = roll_out(policy, made, seed=seed, episodes=episodes)
+    row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
+    row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
+    if json_output:
+        print(json.dumps(row))
+    else:
+        print(f"{shown(policy.task)}: return {result.mean:.1f} +- {row['return_std']:.1f} over {episodes} episodes")
+        print("  " + "  ".join(f"{value:.1f}" for value in result.returns))
+    return 0
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("evaluate", evaluate, words)

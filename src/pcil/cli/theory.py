@@ -1,0 +1,42 @@
+"""`pcil theory`."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from pcil.cli import arguments
+from pcil.errors import shown
+
+
+def theory(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """Check the paper's Theorem 1 numerically, and draw it.
+
+    Args:
+        out: Folder of theory.png and theory.pdf; by default the current one, or no figure with --json.
+        seed: The random pairs follow from it.
+        json_output: Print one JSON object and nothing else.
+    """
+    from pcil import theory
+
+    arguments.within(0, 2**31 - 1, seed=seed)
+    pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
+    figures = theory.measure(pairs)
+    drawn = ""
+    if out is not None or not json_output:
+        try:
+            from pcil.theory.figure import draw
+        except ImportError:
+            drawn = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
+        else:
+            drawn = shown(f"Figure: {draw(pairs, out or Path())}")
+    print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")
+    if json_output and drawn:
+        print(drawn, file=sys.stderr)
+    return 0
+
+
+def main(words: list[str]) -> int:
+    return arguments.call("theory", theory, words)

@@ -1,0 +1,1 @@
+"""Networks and losses: mathematics with no state of its own."""

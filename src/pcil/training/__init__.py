@@ -1,0 +1,1 @@
+"""Training: what a run is, its loop, and what it leaves."""

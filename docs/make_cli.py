@@ -60,9 +60,8 @@ def _reward_options(text: str) -> str:
 
 def page() -> str:
     """The whole of cli.md."""
-    from pcil.presets import METHODS
-
     from pcil.cli import COMMANDS
+    from pcil.training.presets import METHODS
 
     parts = [INTRODUCTION, _block(help_of())]
     for command in COMMANDS:

@@ -132,10 +132,10 @@ def trial(method: str, demos: str, folder: Path, seconds: float, rng: random.Ran
 def differences(whole: Path, folder: Path) -> Iterator[str]:
     """What differs between a run that was left alone and one that was not, wall-clock times left out."""
     import numpy as np
-
-    from pcil.training import checkpoint
     from test_loop import rows
     from test_metrics import points
+
+    from pcil.training import checkpoint
 
     if rows(whole) != rows(folder):
         yield "logs"
@@ -152,7 +152,7 @@ def differences(whole: Path, folder: Path) -> Iterator[str]:
 
 
 def main() -> int:
-    sys.path.insert(0, str(Path(__file__).parent))
+    sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "training")]
     from pcil.training import presets
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])

@@ -170,8 +170,9 @@ def main() -> int:
     parser.add_argument("--number", "-n", type=int, help="how many mutants, drawn at random; by default all of them")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
     options = parser.parse_args()
-    chosen = [name for name in guards if not options.files or {name, name.partition("/")[0]} & set(options.files)]
-    if missing := [name for name in options.files if not any({n, n.partition("/")[0]} & {name} for n in guards)]:
+    called = {name: {name, *name.split("/")} for name in guards}
+    chosen = [name for name in guards if not options.files or called[name] & set(options.files)]
+    if missing := [name for name in options.files if not any(name in names for names in called.values())]:
         parser.error(f"no tests guard {', '.join(missing)}; the files are {', '.join(guards)}")
     os.chdir(ROOT)
     os.environ.setdefault("MUJOCO_GL", "disabled")

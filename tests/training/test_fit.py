@@ -16,6 +16,7 @@ import pytest
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_demos import edit_metadata, forget_checksum, refusal
 
 import pcil.training.fit
 from pcil import demos, envs
@@ -27,7 +28,6 @@ from pcil.training import checkpoint, loop, presets, runs
 from pcil.training.config import Run
 from pcil.types import Episode, Origin
 from small import POINT_MASS, save_point_mass_demos, small_run
-from test_demos import edit_metadata, forget_checksum, refusal
 
 
 class Slider(gymnasium.Env):

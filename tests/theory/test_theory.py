@@ -528,7 +528,7 @@ def test_json_is_one_object_and_nothing_else_and_imports_no_jax(tmp_path: Path) 
         assert row["relaxed_below"] == 0 and row["relaxed_min"] >= 0.25 and row["relaxed_max"] <= 2
         assert row["gap"] < SOLVED and row["true_min"] <= row["relaxed_min"]
     assert figures["pairs"][0]["true_below"] > 0.2 and figures["pairs"][-1]["true_below"] == 0
-    page = (Path(__file__).parent.parent / "docs" / "theory.md").read_text()
+    page = (Path(__file__).parent.parent.parent / "docs" / "theory.md").read_text()
     cells = "| {atoms} |" + "".join(f" {{{x}_min:.4f}} | {{{x}_max:.4f}} | {{{x}_below:.1%}} |" for x in ("relaxed", "true"))
     assert all(cells.format(**row) in page for row in figures["pairs"])
 

@@ -13,7 +13,7 @@ from pcil import demos, envs
 from pcil.policy import load_policy
 
 TASKS = demos.shipped_tasks()
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 POLICIES = demos.SHIPPED.parent / "policies"
 
 

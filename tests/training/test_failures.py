@@ -15,6 +15,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from test_loop import StopAfter, finish, rows, same_run
 
 import pcil
 from odd import Odd, raising
@@ -25,7 +26,6 @@ from pcil.training import checkpoint, learner, loop, presets, runs
 from pcil.training.config import Run
 from pcil.types import Spec
 from small import random_batch, small_run, windows
-from test_loop import StopAfter, finish, rows, same_run
 
 ID = "pcil_test/odd-v0"
 NAN = float("nan")

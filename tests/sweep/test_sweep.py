@@ -26,6 +26,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
+from test_loop import StopAfter, finish, same_run
 
 from pcil import cli, sweep
 from pcil.envs import TASKS
@@ -34,9 +35,8 @@ from pcil.rewards import REWARDS
 from pcil.sweep import plans
 from pcil.training import checkpoint, loop, runs
 from small import POINT_MASS, save_point_mass_demos, small_run
-from test_loop import StopAfter, finish, same_run
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 ARMS = "toy-point_mass-v0"
 NARROW = """
 seed_frames = 100

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
-from pcil.agents import DrQV2
+from pcil.agents import AGENTS, DrQV2
 from pcil.envs import TASKS
 from pcil.errors import InputError, check_kinds
 from pcil.rewards import PCIL, REWARDS, TaskReward
 from pcil.training import presets
-from pcil.training.config import Run, completed, differences
+from pcil.training.config import Run, completed, differences, registered, renamed
 
 EVERY_RUN = sorted(presets.METHOD_SETTINGS)
 
@@ -127,7 +127,7 @@ def test_differences_name_what_changed_however_deep() -> None:
 def test_another_reward_is_a_difference_even_where_its_settings_are_equal() -> None:
     run = presets.make("walker_walk", "expert")
     found = differences(to_json(run), to_json(dataclasses.replace(run, label="stored", reward=WholeEpisodes())))
-    assert found[-1].startswith("reward.class was pcil.rewards.task:TaskReward, now ") and "WholeEpisodes" in found[-1]
+    assert found[-1].startswith("reward.class was expert, now ") and "WholeEpisodes" in found[-1]
 
 
 def test_fields_that_one_side_lacks_are_differences() -> None:
@@ -271,7 +271,7 @@ def test_numpys_numbers_are_numbers() -> None:
 
 def test_no_third_word_is_taken_in_python_either() -> None:
     """It would fit neither of the two that the loop asks for; in a process of its own, where no test watches over types."""
-    code = "from pcil import presets; presets.make('walker_walk', label='store')"
+    code = "from pcil.training import presets; presets.make('walker_walk', label='store')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "InputError: Run.label is 'store'; it must be one of 'sampled', 'stored'" in done.stderr
 
@@ -296,3 +296,16 @@ def test_released_has_the_batch_of_bc_and_the_length_of_an_expert_by_task(
     assert presets.make(task, "bc").agent.batch_size == presets.make(task, "bc", "paper").agent.batch_size == 128
     assert presets.make(task, "expert", "released", frames=5000).frames == 5000
     assert presets.make(task, "bc", "released", **{"agent.batch_size": 7}).agent.batch_size == 7
+
+
+def test_classes_go_by_their_names_in_the_registry_and_paths_of_older_files_are_known() -> None:
+    """Wherever a class of ours lay when the file was written; a person's own class goes by its path."""
+    for method in presets.METHODS:
+        settings = presets.make("walker_walk", method).to_json()
+        assert AGENTS[settings["agent"]["class"]] and REWARDS[settings["reward"]["class"]]
+    assert registered("agent", "pcil.agents.drqv2:DrQV2") == registered("agent", "pcil.old.place:DrQV2") == "drqv2"
+    assert registered("reward", "my.module:PCIL") == "my.module:PCIL" and registered("reward", "pcil") == "pcil"
+    now = presets.make("walker_walk").to_json()
+    old = {**now, "agent": {**now["agent"], "class": "pcil.agents.drqv2:DrQV2"}}
+    old |= {"reward": {**now["reward"], "class": "pcil.rewards.pcil:PCIL"}}
+    assert old != now and renamed(old) == renamed(now) == now

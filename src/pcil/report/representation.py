@@ -17,7 +17,7 @@ from pcil.report.load import Collection, Dot, Point, Source, flat, named, place
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.training import learner, loop, presets, runs
-from pcil.training.config import Run
+from pcil.training.config import REGISTRIES, Run, registered
 from pcil.types import Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
@@ -84,7 +84,8 @@ def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[D
 def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
     try:
-        return flat(_made(settings).plain.to_json()) | settings
+        own = {f"{part}.class": registered(part, settings[f"{part}.class"]) for part in REGISTRIES}
+        return flat(_made(settings).plain.to_json()) | settings | own
     except Exception:  # presets are made for settings of every kind, here of a file from anywhere
         return settings
 

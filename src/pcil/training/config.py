@@ -10,12 +10,13 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from pcil.agents import Agent, DrQV2
+from pcil.agents import AGENTS, Agent, DrQV2
 from pcil.errors import InputError, check_kinds, check_ranges, json_object
-from pcil.rewards import PCIL, Reward
+from pcil.rewards import PCIL, REWARDS, Reward
 
 MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
 """Settings that change no result, so a run may resume with others."""
+REGISTRIES: dict[str, dict[str, Any]] = {"agent": AGENTS, "reward": REWARDS}
 EnvKwargs = Annotated[
     dict[str, Any],
     tyro.constructors.PrimitiveConstructorSpec(
@@ -140,12 +141,26 @@ class Run:
         return _plain(self, **kept, agent=agent, reward=_plain(self.reward))
 
     def to_json(self) -> dict[str, Any]:
-        """Every setting, nested, as JSON gives it back; agent and reward say their class."""
+        """Every setting, nested, as JSON gives it back; agent and reward say their class, ours by its name in the registry."""
         tree = dataclasses.asdict(self)
-        for name in ("agent", "reward"):
+        for name in REGISTRIES:
             kind = type(getattr(self, name))
-            tree[name] = {"class": f"{kind.__module__}:{kind.__qualname__}", **tree[name]}
+            tree[name] = {"class": registered(name, f"{kind.__module__}:{kind.__qualname__}"), **tree[name]}
         return json.loads(json.dumps(tree))
+
+
+def registered(part: str, path: str) -> str:
+    """The registry's name of one of our own agents or rewards, by the path of its class in this version or an older one; other
+    names stay as they are."""
+    own = {kind.__qualname__: name for name, kind in REGISTRIES[part].items()}
+    module, _, name = path.partition(":")
+    return own.get(name, path) if module.startswith("pcil.") else path
+
+
+def renamed(settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a `run.json`, of an older version too, with the classes by the names that they have today."""
+    parts = {part: {**settings[part], "class": registered(part, settings[part]["class"])} for part in REGISTRIES}
+    return {**settings, **parts}
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:

@@ -22,7 +22,7 @@ from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError, brief
 from pcil.policy import Policy, load_policy
 from pcil.training import fit, loop, presets, progress, state
-from pcil.training.config import Run, changed, completed, differences
+from pcil.training.config import Run, changed, completed, differences, renamed
 from pcil.training.evaluate import Evaluation
 from pcil.training.metrics import LOGS
 
@@ -276,7 +276,7 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
         before = files.read_json(folder / "run.json")
-        found = differences(completed(before["run"], run.plain.to_json()), identity["run"])
+        found = differences(completed(renamed(before["run"]), run.plain.to_json()), identity["run"])
         found += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(

@@ -19,6 +19,7 @@ from pcil.nets.networks import (
     LAYER_NORM_EPSILON,
     MLP,
     SCALED_BOUND,
+    SCALER_FLOOR,
     SCALER_RATE,
     Actor,
     Critic,
@@ -348,6 +349,14 @@ def test_an_entry_that_never_varies_is_scaled_to_zero_and_one_that_leaves_it_is_
     assert scaler.mean[0] == np.float32(value) and scaler.variance[0] == 0
     assert scaled(scaler, jnp.full((2, 1), value))[0, 0] == 0
     assert abs(scaled(scaler, jnp.full((2, 1), value + 1e7))[0, 0]) <= SCALED_BOUND
+
+
+def test_the_floor_of_the_deviation_is_a_share_of_the_mean_and_the_bound_is_ten_deviations() -> None:
+    still = Scaler(jnp.array([4.0, -4.0, 0.5]), jnp.zeros(3), jnp.float32(9.0))
+    expected = np.array([4.0, 4.0, 0.5]) * SCALER_FLOOR
+    np.testing.assert_allclose(still.normalizer.deviation, expected, rtol=1e-6)
+    plain = Scaler(jnp.zeros(2), jnp.ones(2), jnp.float32(9.0))
+    np.testing.assert_array_equal(scaled(plain, jnp.array([[9.75, 1e6], [-9.75, -1e6]])), [[9.75, 10.0], [-9.75, -10.0]])
 
 
 def test_an_entry_that_stays_where_it_is_for_long_is_not_blown_up() -> None:

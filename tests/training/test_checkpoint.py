@@ -143,6 +143,11 @@ def test_newest_is_by_number_and_not_by_letter(folder: Path) -> None:
     assert checkpoint.restore(folder)[1] == {"frames": 100}
 
 
+def test_the_first_save_makes_the_folder(tmp_path: Path) -> None:
+    checkpoint.save(tmp_path / "a" / "b", 1, make_arrays(1), {})
+    assert same(checkpoint.restore(tmp_path / "a" / "b")[0], make_arrays(1))
+
+
 def test_where_there_is_none_nothing_is_restored(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "other" / "notes").mkdir(parents=True)
@@ -241,6 +246,13 @@ DAMAGES: dict[str, Callable[[Path], Any]] = {
 }
 
 
+REASONS = {
+    "no arrays": "arrays.safetensors is missing)",
+    "half of the arrays": "arrays.safetensors is not what was written)",
+    "no meta.json": "FileNotFoundError: ",
+}
+
+
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_one_sentence(folder: Path, damage: str) -> None:
     DAMAGES[damage](folder / "20")
@@ -248,6 +260,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_one_sentence(folde
     assert same(arrays, make_arrays(10))
     assert counters == {"frames": 10}
     assert len(complaints) == 1 and is_one_sentence_about(complaints[0], folder / "20")
+    assert REASONS.get(damage, "") in complaints[0]
 
 
 def test_where_all_are_damaged_there_is_a_sentence_for_each_and_no_state(folder: Path) -> None:

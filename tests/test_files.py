@@ -414,7 +414,7 @@ def test_what_the_system_refuses_is_one_sentence(
     def raises(_: list[str]) -> int:
         raise error
 
-    monkeypatch.setitem(cli.COMMANDS, "demos", raises)
+    monkeypatch.setattr("pcil.cli.demos.main", raises)
     assert cli.main(["demos"]) == code
     err = capsys.readouterr().err
     assert err.startswith("pcil: ") and err.count("\n") == 1 and len(err) < 700
@@ -424,7 +424,7 @@ def test_what_is_none_of_these_is_raised(monkeypatch: pytest.MonkeyPatch) -> Non
     def raises(_: list[str]) -> int:
         raise RuntimeError("a mistake of ours")
 
-    monkeypatch.setitem(cli.COMMANDS, "demos", raises)
+    monkeypatch.setattr("pcil.cli.demos.main", raises)
     with pytest.raises(RuntimeError, match="a mistake of ours"):
         cli.main(["demos"])
 

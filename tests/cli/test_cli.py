@@ -269,7 +269,7 @@ def test_the_version_is_that_of_the_package() -> None:
 def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([command, "--help"]) == 0
     out, err = capsys.readouterr()
-    assert f"usage: pcil {command}" in out and cli.COMMANDS[command].__doc__.rstrip(".") in out and err == ""
+    assert f"usage: pcil {command}" in out and cli.COMMANDS[command].rstrip(".") in out and err == ""
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) ->
 
 def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
-    monkeypatch.setattr(cli, "_run", lambda run, out: runs.append(run) or 0)
+    monkeypatch.setattr("pcil.cli.train._run", lambda run, out: runs.append(run) or 0)
     assert cli.main(["train", "dmc/walker_walk-v0", "--out", "new"]) == 0
     assert cli.main(["train", "--out", "new", "walker_walk"]) == 0
     assert runs[0] == runs[1] == presets.make("walker_walk")
@@ -474,7 +474,7 @@ def test_interrupts_exit_with_130(
     def interrupt(words: list[str]) -> int:
         raise KeyboardInterrupt
 
-    monkeypatch.setitem(cli.COMMANDS, name, interrupt)
+    monkeypatch.setattr(f"pcil.cli.{name}.main", interrupt)
     assert cli.main([name]) == 130
     assert said in capsys.readouterr().err
 

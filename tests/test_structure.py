@@ -28,7 +28,7 @@ LAYERS = [
     "envs arrays minari_files demos replay policy rewards agents",
     "config presets evaluate checkpoint metrics learner state loop fit runs progress",
     "representation film reporting",
-    "bench doctor arguments plans sweep cli",
+    "bench doctor arguments plans worker executors cluster sweep sweeping cli",
 ]
 """A part imports from its own layer and those above it in this list; `report` stands aside, for `REPORTERS` alone."""
 REPORTERS = {"plans", "cli", "representation", "film", "reporting"}

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from pcil import bench, worker
 from pcil.errors import InputError
@@ -22,6 +22,7 @@ QUOTA = Path("/sys/fs/cgroup/cpu.max")
 """Where Linux says how many microseconds of how many a container may compute."""
 
 
+@runtime_checkable
 class Executor(Protocol):
     """A place that trains runs side by side. A handle stands for one start of a run."""
 
@@ -69,6 +70,7 @@ class Local:
         for process in self._running:
             process.kill()
         for process in self._running:
+            self.stop(process)
             process.wait()
 
     def room(self) -> int:

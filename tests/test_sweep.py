@@ -190,6 +190,60 @@ def test_a_folder_with_other_settings_is_refused_even_if_it_is_done(demos: str) 
         plan(text.replace("frames = 300", "frames = 400"))
 
 
+# --- Without a file ---
+
+
+def planned(*words: str) -> list[plans.Job]:
+    """What `pcil sweep` with these words would train."""
+    with mock.patch.object(sweep, "sweep", return_value=0) as started:
+        assert cli.main(["sweep", *words, "--out", "out"]) == 0
+    return started.call_args.args[0].jobs
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (
+            "finger_spin hopper_hop --methods expert dac --seeds 4 2 --frames 6000 --preset paper",
+            "tasks = ['finger_spin', 'hopper_hop']\nmethods = ['expert', 'dac']\nseeds = [4, 2]\n"
+            "frames = 6000\npreset = 'paper'",
+        ),
+        ("finger_spin", "tasks = ['finger_spin']\nmethods = ['pcil']\nseeds = [1, 2, 3]"),
+        ("sweep.toml", WHOLE),
+    ],
+)
+def test_tasks_without_a_file_are_the_runs_of_a_file_that_says_the_same(words: str, text: str) -> None:
+    expected = [(job.name, job.folder, job.run) for job in plan(text).jobs]
+    assert [(job.name, job.folder, job.run) for job in planned(*words.split())] == expected
+
+
+def test_a_module_that_a_person_names_as_a_task_needs_no_trust() -> None:
+    Path("typed_task.py").write_text("import pcil.envs.toy")
+    task = f"typed_task:{POINT_MASS}"
+    assert [job.run.task for job in planned(task, "--methods", "expert")] == [task] * 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "Nothing is named; give a FILE.toml, or tasks"),
+        (["sweep.toml", "finger_spin"], "finger_spin is given beside sweep.toml"),
+        (["sweep.toml", "--seeds", "1"], "--seeds is given beside sweep.toml"),
+        (["sweep.toml", "--preset=default"], "--preset is given beside sweep.toml"),
+        (["finger_spin", "--seeds"], "The command gives no seeds"),
+        (["finger_spin", "--seeds", "1", "1"], "The command has the run finger_spin/pcil/1 a second time"),
+        (["finger_spin", "--methods", "gial"], "no method 'gial'"),
+        (["fingerspin"], "no environment 'fingerspin'"),
+    ],
+)
+def test_words_that_name_no_runs_are_one_sentence(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("sweep.toml").write_text(WHOLE)
+    assert cli.main(["sweep", *words, "--out", "out"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("pcil: ") and said in err and err.count("\n") == 1
+    assert not Path("out").exists()
+
+
 # --- What is read from the folders, and shown ---
 
 

@@ -60,6 +60,7 @@ def test_a_process_has_the_words_and_the_threads_of_its_run_and_its_input_stops_
         given = {"OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
         assert variables == f"{given | {'XLA_FLAGS': None, 'CUDA_VISIBLE_DEVICES': None}}\n"
         assert local.poll(handle) is None
+        assert os.getpgid(handle.pid) != os.getpgrp(), "a terminal's Ctrl-C does not reach it"
         local.stop(handle)
         assert ended(local, handle) == 0 and job.log.read_text().endswith("asked\n")
 
@@ -206,6 +207,15 @@ def test_a_killed_run_frees_its_core(monkeypatch: pytest.MonkeyPatch) -> None:
         other.kill()
     with worker.own_cores(1):
         assert bound == [{core}]
+
+
+def test_a_run_finds_no_library_in_the_present_folder() -> None:
+    Path("tyro.py").write_text("raise SystemExit(70)")
+    command = [*executors.WORKER, "folder", "1", "finger_spin", "--help"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert "usage: pcil train" in process.stdout.read()
+    assert process.returncode == 0
 
 
 PARENT = """

@@ -563,7 +563,7 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(
 
     process = session.start(*words)
     with held([one, two], process):
-        process.send_signal(signal.SIGINT)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     printed, _ = process.communicate(timeout=400)
     assert process.returncode == 130 and "the same command goes on from here" in printed
     for job in (one, two):

@@ -1,6 +1,6 @@
 """Runs side by side: the same runs with one job and with two, and the ratio of their speeds: `python benchmarks/sweep.py`.
 
-Once of whole commands, with the start of Ray and the imports of each run, and once of the training alone, as `eval.csv` has it.
+Once of whole commands, with the imports of each run, and once of the training alone, as `eval.csv` has it.
 """
 
 from __future__ import annotations

@@ -261,6 +261,13 @@ class Outcome(NamedTuple):
     said: str
 
 
+def refuse(*_: Any) -> None:
+    """In place of a sweep that would begin."""
+    from pcil.errors import InputError
+
+    raise InputError("No run is started here; this sweep is good.")
+
+
 def run(words: list[str], folder: Path) -> Outcome:
     """The command in a process of its own, which is forked from this one."""
     began, child = time.monotonic(), os.fork()
@@ -273,9 +280,9 @@ def run(words: list[str], folder: Path) -> Outcome:
                 os.dup2(os.open(folder / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            sys.modules["ray"] = None  # type: ignore[assignment] - a sweep that would begin is refused
-            from pcil import cli
+            from pcil import cli, executors
 
+            executors.Local.__init__ = refuse
             code = cli.main(words)
             sys.stdout.flush()
         except SystemExit as stop:

@@ -16,7 +16,7 @@ COMMANDS = {
     "record": "Record demonstrations from a trained policy.",
     "theory": "Check the paper's Theorem 1 numerically, and draw it.",
     "report": "Draw figures, tables and a page from runs.",
-    "sweep": "Train every run of a file, side by side.",
+    "sweep": "Train many runs, side by side.",
     "bench": "Measure the speed of each part, and its ratio to the floor.",
     "doctor": "Say what is installed, what is wrong, and what to do.",
 }

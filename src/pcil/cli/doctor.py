@@ -127,7 +127,7 @@ CHECKS: tuple[Check, ...] = (
     ("compilation cache", _cache, "set JAX_COMPILATION_CACHE_DIR to a folder that can be written", False),
     ("figures", _importable("matplotlib", "matplotlib"), "pip install '.[report]' in a clone", False),
     ("optimal transport", _importable("ot", "pot"), "pip install --force-reinstall pot", False),
-    ("sweeps", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
+    ("Ray clusters", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
     ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
 )
 

@@ -1,30 +1,63 @@
-"""`pcil sweep`."""
+"""`pcil sweep`: a file of runs, or tasks with methods and seeds."""
 
 import sys
 from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
 
 from pcil.cli import arguments
+from pcil.errors import InputError
 from pcil.modules import Trust
 
-
-def sweep(file: Path, /, out: Path, jobs: int | None = None, address: str | None = None, trust: Trust = ()) -> int:
-    """Train every run of a file, side by side; the same command skips what is done and resumes the rest.
-
-    Exit code 1 says that a run failed; the others were finished all the same.
-
-    Args:
-        file: The runs, in TOML; docs/sweeps.md says how.
-        out: Each run's folder is OUT/TASK/METHOD/SEED.
-        jobs: Runs at the same time; by default as many as there are cores for.
-        address: A Ray cluster, such as 10.0.0.1:6379; by default one is started on this machine, and stopped at the end.
-        trust: Modules that the file may name as tasks or rewards, whose code is then run, such as my.module.
-    """
-    from pcil import files, sweep
-    from pcil.training import progress
-
-    arguments.within(1, 100_000, jobs=1 if jobs is None else jobs)
-    return sweep.sweep(file, files.expanded(out), jobs, address, progress.Screen(file=sys.stdout), trust)
+_OF_TASKS = {"--methods", "--seeds", "--preset", "--frames"}
+"""Options of tasks; a file says of itself what they would."""
 
 
 def main(words: list[str]) -> int:
+    def sweep(
+        what: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE|TASK...", help_behavior_hint="")],
+        /,
+        out: Path,
+        methods: tuple[str, ...] = ("pcil",),
+        seeds: tuple[int, ...] = (1, 2, 3),
+        preset: str = "default",
+        frames: int | None = None,
+        jobs: int | None = None,
+        address: str | None = None,
+        trust: Trust = (),
+    ) -> int:
+        """Train many runs, side by side; the same command skips what is done and resumes the rest.
+
+        Exit code 1 says that a run failed; the others were finished all the same.
+
+        Args:
+            what: The runs, in a TOML file (docs/sweeps.md says how), or tasks, each with every method and seed.
+            out: Each run's folder is OUT/TASK/METHOD/SEED.
+            methods: Methods, where tasks are named.
+            seeds: Seeds, where tasks are named.
+            preset: Their settings, as in pcil train.
+            frames: Their length; by default as in pcil train.
+            jobs: Runs at the same time; by default as many as there are cores for.
+            address: A Ray cluster, such as 10.0.0.1:6379; by default the runs are trained on this machine.
+            trust: Modules that the file may name as tasks or rewards, whose code is then run, such as my.module.
+        """
+        from pcil import files, sweep
+        from pcil.sweep import plans
+        from pcil.training import progress
+
+        arguments.within(1, 100_000, jobs=1 if jobs is None else jobs)
+        if not what:
+            raise InputError("Nothing is named; give a FILE.toml, or tasks such as walker_walk.")
+        out = files.expanded(out)
+        if not what[0].endswith(".toml"):
+            table: dict[str, Any] = {"tasks": list(what), "methods": list(methods), "seeds": list(seeds), "preset": preset}
+            table |= {} if frames is None else {"frames": frames}
+            plan = plans.of_table("The command", table, out, None)
+        elif other := [*what[1:], *sorted({word.partition("=")[0] for word in words} & _OF_TASKS)]:
+            raise InputError(f"{other[0]} is given beside {what[0]}; a file says itself what its runs are.")
+        else:
+            plan = plans.read(Path(what[0]), out, trust)
+        return sweep.sweep(plan, out, jobs, address, progress.Screen(file=sys.stdout))
+
     return arguments.call("sweep", sweep, words)

@@ -50,6 +50,8 @@ class Job:
     """Frames a second."""
     last_return: float = 0.0
     """Mean of the last evaluation."""
+    deaths: int = 0
+    """How often its process was killed."""
 
     def look(self) -> None:
         """Read the folder; a file that is not there yet, or half written, changes nothing."""
@@ -65,7 +67,7 @@ class Job:
 
 
 class Plan(NamedTuple):
-    """What a file asks for."""
+    """What a sweep is to train."""
 
     jobs: list[Job]
     cores: int
@@ -82,11 +84,16 @@ def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
     except (OSError, ValueError) as error:
         raise InputError(f"{file} can't be read as TOML ({error}).") from error
     _check(str(file), table, FILE)
+    return of_table(str(file), table, out, trust)
+
+
+def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str] | None) -> Plan:
+    """The same of what a file holds; `trust` is None where a person typed it, who `source` then is."""
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))
     if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
         given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
-        raise InputError(f"{file} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
-    for where, product in _products(str(file), table):
+        raise InputError(f"{source} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
+    for where, product in _products(source, table):
         for name, words in _combinations(where, product):
             if any(job.name == name for job in plan.jobs):
                 raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
@@ -100,7 +107,7 @@ def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
             plan.jobs.append(Job(name, folder, words, found[0], folder.with_name(f"{folder.name}.log")))
             plan.jobs[-1].look()
     if not plan.jobs:
-        raise InputError(f"{file} has no runs; give it tasks, methods and seeds, or [[runs]] with them.")
+        raise InputError(f"{source} has no runs; give it tasks, methods and seeds, or [[runs]] with them.")
     return plan
 
 

@@ -199,7 +199,7 @@ def test_a_killed_run_frees_its_core(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {core})
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))
     text = f"import os\nos.sched_getaffinity = lambda _: {{{core}}}\nos.sched_setaffinity = lambda *_: print(flush=True)\n"
-    text += "from pcil import worker\nheld = worker.own_cores(1)\ninput()"
+    text += "from pcil.sweep import worker\nheld = worker.own_cores(1)\ninput()"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", text], **pipes) as other:
         assert other.stdout.readline() == "\n"

@@ -32,7 +32,7 @@ from pcil.sweep import executors, plans
 from pcil.training import checkpoint, loop, progress, runs
 from small import POINT_MASS, save_point_mass_demos, small_run
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parent.parent.parent
 ARMS = "toy-point_mass-v0"
 NARROW = """
 seed_frames = 100

@@ -221,7 +221,7 @@ def test_a_run_finds_no_library_in_the_present_folder() -> None:
 
 PARENT = """
 import subprocess, sys, time
-code = "import time; from pcil import worker; worker.train = lambda *_: time.sleep(400); worker.main()"
+code = "import time; from pcil.sweep import worker; worker.train = lambda *_: time.sleep(400); worker.main()"
 child = subprocess.Popen([sys.executable, "-c", code, "folder", "1"], stdin=subprocess.PIPE)
 print(child.pid, flush=True)
 time.sleep(400)

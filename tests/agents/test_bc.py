@@ -67,3 +67,21 @@ def test_a_run_clones_the_optimal_policy_without_a_step_in_the_environment(
     untrained = AGENT.init(envs.spec(envs.make(POINT_MASS)), key=jax.random.key(0)).actor(jnp.asarray(recorded.obs))
     assert np.mean(error**2) < 0.1 * np.mean((np.asarray(untrained) - recorded.action) ** 2)
     assert result.demos_return == recorded.return_mean
+
+
+def test_an_update_reads_the_first_step_of_a_window_and_no_other() -> None:
+    """Whatever follows it, and however long the window is."""
+    key, batch = jax.random.key(0), random_batch(40, 3, 2)
+    state = AGENT.init(Spec(3, 2, 1), key=key)
+    one, three = windows(batch, 1), windows(batch, 3)
+    first = one._replace(**{name: value[: len(three.obs)] for name, value in one._asdict().items()})
+    updated = [AGENT.update(state, jax.tree.map(jnp.asarray, window), step=jnp.int32(0), key=key)[0] for window in (first, three)]
+    for a, b in zip(*map(jax.tree.leaves, updated), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_it_acts_without_noise() -> None:
+    state = AGENT.init(Spec(3, 2, 1), key=jax.random.key(0))
+    actor = jax.tree.map(np.asarray, AGENT.actor(state))
+    obs = random_batch(1, 3, 2).obs[0]
+    np.testing.assert_array_equal(AGENT.explorer(2, np.random.default_rng(0))(actor, obs, 7), actor(obs, np))

@@ -280,7 +280,8 @@ def run(words: list[str], folder: Path) -> Outcome:
                 os.dup2(os.open(folder / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), stream)
             os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            from pcil import cli, executors
+            from pcil import cli
+            from pcil.sweep import executors
 
             executors.Local.__init__ = refuse
             code = cli.main(words)
@@ -373,7 +374,11 @@ def main() -> int:
                 words = rng.choice(source.commands).split()
                 if (name := " ".join(words)) not in usual:
                     shutil.copytree(good, folder)
-                    usual[name] = run(words, folder).memory
+                    whole = run(words, folder)
+                    usual[name] = whole.memory
+                    if whole.code != (2 if words[0] == "sweep" else 0) or "Traceback" in whole.said:
+                        print(f"pcil {name} fails on what was not changed:\n{whole.said}")
+                        return 2
                     shutil.rmtree(folder)
                 shutil.copytree(good, folder)
                 file, before = rng.choice(source.files), usual[name]

@@ -210,7 +210,10 @@ class Input(NamedTuple):
 
 READ_POLICY = ("evaluate run --episodes 1", "record run --episodes 1 --out new")
 READ_RUN = ("report run --out new --no-rollouts", "report run --out new", f"{TRAIN} --method expert --out run", *READ_POLICY)
-READ_DATA = (f"{TRAIN} --method bc --demos data --out new", f"{TRAIN} --method pcil --reward.hidden 16 --demos data --out new")
+READ_DATA = (
+    f"{TRAIN} --method bc --demos data --out new",
+    f"{TRAIN} --method pcil --reward.hidden 16 --reward.batch-size 32 --demos data --out new",
+)
 INPUTS = {
     "dataset": Input(("data/data/main_data.hdf5",), (bytes_changed, hdf5_changed, hdf5_changed), READ_DATA),
     "dataset's metadata": Input(("data/data/metadata.json",), (bytes_changed, json_changed, json_changed), READ_DATA),

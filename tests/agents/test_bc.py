@@ -75,7 +75,9 @@ def test_an_update_reads_the_first_step_of_a_window_and_no_other() -> None:
     state = AGENT.init(Spec(3, 2, 1), key=key)
     one, three = windows(batch, 1), windows(batch, 3)
     first = one._replace(**{name: value[: len(three.obs)] for name, value in one._asdict().items()})
-    updated = [AGENT.update(state, jax.tree.map(jnp.asarray, window), step=jnp.int32(0), key=key)[0] for window in (first, three)]
+    updated = [
+        AGENT.update(state, jax.tree.map(jnp.asarray, window), step=jnp.int32(0), key=key)[0] for window in (first, three)
+    ]
     for a, b in zip(*map(jax.tree.leaves, updated), strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -130,6 +130,14 @@ def test_methods_without_a_common_task_are_not_compared(tmp_path: Path) -> None:
     assert tables.improvement(collect([tmp_path])).rows == []
 
 
+def test_methods_without_an_evaluation_in_common_are_not_compared(tmp_path: Path) -> None:
+    fake_run(tmp_path / "a", [1.0, 2.0], method="pcil")
+    fake_run(tmp_path / "b", [3.0, 4.0], method="dac")
+    found = collect([tmp_path])
+    moved = [point._replace(frames=point.frames + 7) if point.method == "dac" else point for point in found.points]
+    assert len(tables.improvement(found).rows) == 1 and tables.improvement(found._replace(points=moved)).rows == []
+
+
 def test_health(sweep: Collection) -> None:
     """PCIL: 0.2 in the first half; 0.5, 0.6, 0.7 in the second, whose interval is +- 4.3027 x 0.1 / sqrt 3 = 0.2484."""
     row = next(row for row in tables.health(sweep).rows if row[:2] == ("walker_run", "pcil"))

@@ -142,7 +142,8 @@ def improvement(found: Collection) -> Table:
     """
     rows = []
     for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points).items(), 2):
-        if pairs := [_at_the_same_frames(x[task], y[task]) for task in x if task in y]:
+        both = (_at_the_same_frames(x[task], y[task]) for task in x if task in y)
+        if pairs := [pair for pair in both if pair]:
             chance = stats.probability_of_improvement(*zip(*pairs, strict=True))
             rows.append((*ours, *theirs, chance, len(pairs)))
     return Table(("method", "variant", "over method", "over variant", "probability", "tasks"), rows)
@@ -232,10 +233,13 @@ def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:
     return int(frames[-1]), returns[:, -1]
 
 
-def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.ndarray, np.ndarray]:
-    """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline."""
+def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline, and
+    None where they have no evaluation in common."""
     if {x[0][0].method, y[0][0].method} & set(OFFLINE):
         return _final(x)[1], _final(y)[1]
+    if not len(matrix([*x, *y])[0]):
+        return None
     last = _final([*x, *y])[1]
     return last[: len(x)], last[len(x) :]
 

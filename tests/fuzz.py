@@ -271,8 +271,8 @@ def refuse(*_: Any) -> None:
     raise InputError("No run is started here; this sweep is good.")
 
 
-def run(words: list[str], folder: Path) -> Outcome:
-    """The command in a process of its own, which is forked from this one."""
+def run(words: list[str], folder: Path, seconds: float = SECONDS) -> Outcome:
+    """The command in a process of its own, which is forked from this one and has so many seconds."""
     began, child = time.monotonic(), os.fork()
     if child == 0:
         code = 70
@@ -298,7 +298,7 @@ def run(words: list[str], folder: Path) -> Outcome:
         finally:
             sys.stderr.flush()
             os._exit(code)
-    while not (ended := os.wait4(child, os.WNOHANG))[0] and time.monotonic() - began < SECONDS:
+    while not (ended := os.wait4(child, os.WNOHANG))[0] and time.monotonic() - began < seconds:
         time.sleep(0.01)
     if not ended[0]:
         os.killpg(child, signal.SIGKILL)
@@ -377,7 +377,7 @@ def main() -> int:
                 words = rng.choice(source.commands).split()
                 if (name := " ".join(words)) not in usual:
                     shutil.copytree(good, folder)
-                    whole = run(words, folder)
+                    whole = run(words, folder, 600.0)  # it compiles
                     usual[name] = whole.memory
                     if whole.code != (2 if words[0] == "sweep" else 0) or "Traceback" in whole.said:
                         print(f"pcil {name} fails on what was not changed:\n{whole.said}")

@@ -60,7 +60,8 @@ def files_of(folder: Path) -> dict[str, list[Path]]:
         "log": [folder / name for name in LOGS],
         "policy": list((folder / "policy").glob("*")),
         "newest checkpoint": list(checkpoints[-1].glob("*")) if len(checkpoints) > 1 else [],
-        "TensorBoard": list((folder / "tensorboard").glob("*")),
+        # of a finished run it is a view that nobody reads again
+        "TensorBoard": [] if (folder / "DONE").exists() else list((folder / "tensorboard").glob("*")),
         "unfinished checkpoint": [path for path in (folder / "checkpoint").glob("partial-*/*") if path.is_file()],
     }
     return {kind: present for kind, paths in kinds.items() if (present := [path for path in paths if path.exists()])}

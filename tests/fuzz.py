@@ -393,6 +393,8 @@ def main() -> int:
                 print(f"{number}: {kind}, {change}: pcil {' '.join(words)[:200]!r}: {found}\n{outcome.said[-600:]}", flush=True)
                 if options.keep:
                     shutil.copytree(folder, options.keep / str(number), dirs_exist_ok=True)
+            if number % 100 == 99:
+                print(f"{number + 1} of {options.number} inputs", file=sys.stderr, flush=True)
     print(", ".join(f"{count} with {word}" for word, count in sorted(ended.items())))
     print(f"{options.number - bad} of {options.number} inputs ended well.")
     return 1 if bad else 0

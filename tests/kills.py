@@ -199,6 +199,8 @@ def main() -> int:
                 print(folder.with_suffix(".said").read_text(), flush=True)
             kinds.update(word.partition(" (")[0] for word in told)
             shutil.rmtree(folder)
+            if number % 10 == 9:
+                print(f"{number + 1} of {options.number} trials", file=sys.stderr, flush=True)
     for word, count in sorted(kinds.items()):
         print(f"{count:6} {word}")
     print(f"{options.number - wrong} of {options.number} runs ended as those that were left alone.")

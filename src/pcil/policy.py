@@ -63,15 +63,29 @@ class Policy:
             )
 
     def save(self, folder: Path) -> None:
-        """Write `policy.safetensors`, which holds its own checksum, and `policy.json` into `folder`, each by a rename, so
-        neither is ever half written."""
+        """Write `policy.safetensors`, which holds its own checksum and that of `policy.json`, and `policy.json` into `folder`,
+        each by a rename, so neither is ever half written."""
         folder.mkdir(parents=True, exist_ok=True)
         arrays = _named(self.actor)
         text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
-        files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": _digest(arrays)})
-        (folder / "policy.json.tmp").write_text(text + "\n")
+        text += "\n"
+        checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"  # one entry: of more the order is random
+        files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": checksums})
+        (folder / "policy.json.tmp").write_text(text)
         for name in ("policy.safetensors", "policy.json"):
             (folder / f"{name}.tmp").replace(folder / name)
+
+
+def as_saved(folder: Path) -> bool:
+    """Whether the `policy.json` of a folder is the one that was saved with its arrays; True of older ones, which don't say.
+
+    One that was edited since may be loaded all the same.
+    """
+    from safetensors import safe_open
+
+    with safe_open(folder / "policy.safetensors", "np") as file:
+        _, _, told = (file.metadata() or {}).get("sha256", "").partition(" ")
+    return told in ("", hashlib.sha256((folder / "policy.json").read_bytes()).hexdigest())
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -120,8 +134,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path.name} is larger than {LARGEST:,} bytes")
     with safe_open(path, "np") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
-        told = (file.metadata() or {}).get("sha256")
-    if told not in (None, _digest(arrays)):
+        told = (file.metadata() or {}).get("sha256", "").partition(" ")[0]
+    if told not in ("", _digest(arrays)):
         raise ValueError("its values do not have their checksum")
     return arrays
 

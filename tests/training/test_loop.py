@@ -208,6 +208,11 @@ def damaged_policy(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-5] + b"12345")
 
 
+def another_digit_in_the_policy(folder: Path) -> None:
+    path = folder / "policy" / "policy.json"
+    path.write_text(path.read_text().replace('"seed": 1', '"seed": 7'))
+
+
 def lost_rows(folder: Path) -> None:
     path = folder / "eval.csv"
     path.write_bytes(path.read_bytes()[:-20])
@@ -227,6 +232,7 @@ def another_return(folder: Path) -> None:
         (without_policy, "holds no policy"),
         (half_a_policy, "holds no policy"),
         (damaged_policy, "is damaged"),
+        (another_digit_in_the_policy, "policy.json is not what the run had written"),
         (lost_rows, "eval.csv is not what the run had written"),
         (no_log, "train.jsonl is not what the run had written"),
         (another_return, "DONE has another return than the last checkpoint"),

@@ -13,7 +13,7 @@ import numpy as np
 
 from pcil.errors import InputError
 from pcil.nets.networks import Actor
-from pcil.policy import load_policy
+from pcil.policy import as_saved, load_policy
 from pcil.rewards import states_read
 from pcil.training import checkpoint, learner
 from pcil.training.config import Run
@@ -129,7 +129,7 @@ def unfinished(folder: Path, final_return: float) -> str | None:
     arrays, meta, _ = checkpoint.restore(folder / "checkpoint")
     try:
         load_policy(folder)
-        damage = None
+        damage = None if as_saved(folder / "policy") else f"{folder / 'policy' / 'policy.json'} is not what the run had written"
     except InputError as error:
         damage = str(error).partition(";")[0]
     if arrays is None:

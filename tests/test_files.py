@@ -405,6 +405,8 @@ def test_a_hostile_sweep_is_one_short_printable_line(text: str, capsys: pytest.C
         (ValueError("RESOURCE_EXHAUSTED: Error opening"), 1),
         (RuntimeError("can't start new thread"), 1),
         (OSError(errno.ENAMETOOLONG, "File name too long", "x" * 5000), 2),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), 2),
+        (OSError(errno.EFBIG, "File too large"), 2),
     ],
     ids=str,
 )

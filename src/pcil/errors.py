@@ -12,6 +12,12 @@ import types
 import typing
 from typing import Any
 
+NO_ROOM = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the quota on the disk is used up",
+    errno.EFBIG: "a file would be larger than the system allows (ulimit -f)",
+}
+"""What the system says where nothing more can be written."""
 WHOLE = 2**53
 """The largest whole number of a setting; up to it a float holds every one."""
 
@@ -52,9 +58,8 @@ def shown(text: str, longest: int = 1500) -> str:
 def said(error: Exception) -> tuple[str, int] | None:
     """The sentence that a command ends with and its exit code; None of an error that only a mistake of ours can raise."""
     if isinstance(error, InputError):
-        return shown(
-            " ".join(str(error).split()).removesuffix(".")
-        ), error.exit_code  # what a library said may have line breaks
+        sentence = " ".join(str(error).split())  # what a library said may have line breaks
+        return shown(sentence.removesuffix(".")), error.exit_code
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN) or isinstance(error, MemoryError):
         scarce = True
@@ -63,7 +68,7 @@ def said(error: Exception) -> tuple[str, int] | None:
     if scarce:
         reason = shown(" ".join(str(error).split()) or "no memory is left", 300)
         return f"The system refuses what this needs ({reason}); raise the limits that ulimit -a shows, or ask for less", 1
-    if isinstance(error, OSError) and (error.filename is not None or number == errno.ENOSPC):
+    if isinstance(error, OSError) and (error.filename is not None or number in NO_ROOM):
         return f"{shown(str(error.filename or 'standard output'), 500)} can't be read or written ({error.strerror})", 2
     return None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import json
 import os
 import re
@@ -14,15 +13,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from pcil.errors import InputError
+from pcil.errors import NO_ROOM, InputError
 
 LARGEST = 16 * 2**20
 """Bytes of a file that is read whole."""
-NO_ROOM = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the quota on the disk is used up",
-    errno.EFBIG: "a file would be larger than the system allows (ulimit -f)",
-}
 DIGITS = 300
 """Of a whole number in JSON; a float holds no more."""
 DEPTH = 100

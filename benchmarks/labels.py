@@ -19,7 +19,6 @@ import numpy as np
 
 from pcil import envs
 from pcil.demos import Demonstrations
-from pcil.rewards import states_read
 from pcil.training import learner, presets
 from pcil.training.replay import Replay
 from pcil.types import Batch
@@ -53,7 +52,7 @@ def main(task: str = "walker_walk") -> None:
     print(f"{task}: {len(demos)} demonstrations of {len(demos[0])} steps\n{'':<32}{'label, ms':>12}{'update, ms':>12}")
     for method, changes in CASES:
         run = presets.make(task, method, **changes)
-        batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
+        batches = tuple(Batch.of(episode.obs, episode.action) for episode in demos)
         state = learner.init(run.learner, spec, batches, 1)
         label = processor_ms(lambda run=run, state=state: learner.label_episode(run.learner, state, demos[0], 0), 5)
         window = expert.sample(rng, run.agent.batch_size, run.agent.n_step)

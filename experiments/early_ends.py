@@ -41,7 +41,7 @@ def main() -> None:
                 for seed in SEEDS:
                     out = place / method / name / str(seed)
                     run = pcil.train(task, method=method, seed=seed, frames=FRAMES, demos=str(dataset), out=out, **settings)
-                    with environments_for(task, STARTS) as copies:
+                    with environments_for(task, STARTS) as (_, copies):
                         lengths.append(evaluate(run.policy, copies, seed=0, episodes=STARTS).lengths.mean())
                 print(f"{task} {method} absorbing {name}:", *(f"{length:.1f}" for length in lengths), flush=True)
 

@@ -98,7 +98,7 @@ def session(method: str, demos: str, folder: Path, every: float, room: int | Non
         if room:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
         try:
-            runs.execute(small_run(method, demos=demos, checkpoint_seconds=every), folder, runs.Silent())
+            runs.execute(small_run(method, demos=demos, checkpoint_seconds=every), folder)
             code = 0
         except InputError as error:
             print(f"pcil: {error}", flush=True)

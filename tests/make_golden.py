@@ -29,8 +29,9 @@ import numpy as np
 from pcil.agents import BC, DrQV2
 from pcil.compilation import use_cache
 from pcil.rewards import REWARDS
-from pcil.training import checkpoint, learner, loop, presets
+from pcil.training import checkpoint, learner, presets
 from pcil.training.config import Run
+from pcil.training.state import start
 from pcil.types import Episode, Spec
 from small import POINT_MASS, narrow, small_run
 
@@ -79,7 +80,7 @@ def five_updates(run: Run) -> dict[str, Any]:
 
     Of a part's arrays, one after the other, these are `sum |x_i|` and `sum x_i cos(i)`, which no two entries enter alike.
     """
-    state = loop.start(run, SPEC, episodes(1, (30, 41, 25)))
+    state = start(run, SPEC, episodes(1, (30, 41, 25)))
     for episode in episodes(2, (37, 30, 45, 28)):
         kept = episode.absorbed(run.agent.n_step) if run.agent.absorbing else episode
         state.replay.add(kept, kept.reward)

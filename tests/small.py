@@ -11,7 +11,7 @@ import numpy as np
 from pcil import demos, envs
 from pcil.envs.toy import PointMass
 from pcil.nets.noise import LinearSchedule
-from pcil.training import presets
+from pcil.training import learner, presets
 from pcil.training.config import Run
 from pcil.types import Batch, Window
 
@@ -60,7 +60,17 @@ def random_batch(rows: int, obs_dim: int, action_dim: int, seed: int = 0) -> Bat
     """Standard normal states and uniform actions."""
     rng = np.random.default_rng(seed)
     obs = rng.standard_normal((rows, obs_dim), dtype=np.float32)
-    return Batch(obs, rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32))
+    return staying(obs, rng.uniform(-1, 1, (rows, action_dim)).astype(np.float32))
+
+
+def staying(obs: np.ndarray, action: np.ndarray) -> Batch:
+    """Steps that lead to where they begin, so that a test need not say which of the two states it means."""
+    return Batch(obs, action, obs)
+
+
+def batches(batch: Batch, n: int = 1) -> Batch:
+    """`windows` as rewards are given them."""
+    return learner.steps(windows(batch, n))
 
 
 def windows(batch: Batch, n: int = 1) -> Window:

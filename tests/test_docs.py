@@ -21,7 +21,7 @@ from pcil.cli import COMMANDS
 from pcil.rewards import REWARDS, Reward, TaskReward
 from pcil.training import checkpoint, learner, presets
 from pcil.training.config import Run
-from pcil.types import Episode, Spec
+from pcil.types import Batch, Episode, Spec
 from small import narrow, random_batch, small_run, windows
 
 ROOT = Path(__file__).parent.parent
@@ -167,11 +167,11 @@ def test_the_example_reward_is_what_it_says(tmp_path: Path, monkeypatch: pytest.
         return obs
 
     state = settings.init([demos], embed, key=jax.random.key(0))
-    got = settings.reward(state, jnp.asarray(states.obs), jnp.asarray(states.action), embed, key=jax.random.key(1))
+    got = settings.reward(state, states, embed, key=jax.random.key(1))
     spread = demos.obs.std(axis=0) + 1e-3
     naive = [-min(np.linalg.norm((s - e) / spread) for e in demos.obs[::4]) for s in states.obs]
     assert got.shape == (7,) and np.allclose(got, naive, atol=1e-3)
-    at_expert = settings.reward(state, jnp.asarray(demos.obs[:1]), jnp.zeros((1, 1)), embed, key=jax.random.key(1))
+    at_expert = settings.reward(state, Batch(*(array[:1] for array in demos[:3])), embed, key=jax.random.key(1))
     assert float(at_expert[0]) == pytest.approx(0.0, abs=1e-2)
     fresh = settings.init([random_batch(40, 3, 1, seed=9)], embed, key=jax.random.key(0))
     restored = checkpoint.unflatten("reward", fresh, checkpoint.flatten("reward", state))

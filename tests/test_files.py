@@ -20,6 +20,7 @@ from fake_runs import fake_run
 from pcil import cli, files
 from pcil.errors import InputError, shown
 from pcil.training import loop, runs
+from pcil.training.callbacks import Callback
 from small import save_point_mass_demos, small_run
 
 HOLD = "import sys, time; from pathlib import Path; from pcil import files\nwith files.locked(Path(sys.argv[1])) as free:\n"
@@ -37,6 +38,7 @@ import importlib, pkgutil, pcil
 for module in pkgutil.walk_packages(pcil.__path__, "pcil."):
     if not module.name.endswith("__main__"):
         importlib.import_module(module.name)
+from pcil.training.callbacks import Callback
 from pcil.training.progress import Signals
 with Signals(lambda: None):
     pass
@@ -199,7 +201,7 @@ def test_json_is_what_it_was() -> None:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     folder = tmp_path_factory.mktemp("finished")
-    runs.execute(small_run(demos=save_point_mass_demos(folder)), folder / "run", runs.Silent())
+    runs.execute(small_run(demos=save_point_mass_demos(folder)), folder / "run")
     return folder / "run"
 
 
@@ -251,7 +253,7 @@ def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
     """While it trains, the same lock is taken; afterwards it is free."""
     seen = []
 
-    class Looks(runs.Silent):
+    class Looks(Callback):
         """Tries the lock from another process after each episode."""
 
         def episode(self, *_: Any) -> None:
@@ -264,7 +266,7 @@ def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
             return True
 
     with pytest.raises(loop.Stopped):
-        runs.execute(small_run("expert"), tmp_path / "run", Looks())
+        runs.execute(small_run("expert"), tmp_path / "run", [Looks()])
     assert seen == ["False\n"]
     with files.locked(tmp_path / "run" / ".lock") as free:
         assert free

@@ -173,3 +173,12 @@ def _whole(digits: str) -> int:
     if len(digits) > DIGITS:
         raise ValueError(f"it holds a number of {len(digits):,} digits")
     return int(digits)
+
+
+def flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested tables by their dotted names; an environment's keyword arguments are one value."""
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        nested = isinstance(value, dict) and name.replace("-", "_") != "env_kwargs"
+        values |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import re
 import sys
@@ -21,6 +22,11 @@ _NAMED = re.compile(r"([^\W\d][\w.]*):[\w-]")
 def of_task(task: str, env_kwargs: Any = None) -> list[str]:
     """The modules that Gymnasium imports for a task, and those that look like code in its environment's keyword arguments."""
     return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
+
+
+def of_class(spec: Any) -> list[str]:
+    """The module of a class that is named as `module:Class`; none of one that goes by its name in a registry."""
+    return [spec.partition(":")[0]] if isinstance(spec, str) and ":" in spec else []
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:
@@ -46,3 +52,17 @@ def _of_values(values: Any) -> list[str]:
         return [found[1]] if found else []
     parts = [*values, *values.values()] if isinstance(values, dict) else values if isinstance(values, list) else []
     return [name for part in parts for name in _of_values(part)]
+
+
+def load(option: str, spec: str, base: type, expected: str) -> Any:
+    """The subclass of `base` that `module:Class` names; `InputError` says that it must look like what is `expected`."""
+    module, _, name = spec.partition(":")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+        if not (isinstance(kind, type) and issubclass(kind, base)):
+            raise TypeError(f"{name} is no subclass of pcil.{base.__name__}")
+        return kind
+    except Exception as error:  # the module is a person's own and may raise anything
+        raise InputError(
+            f"{option} {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like {expected}."
+        ) from error

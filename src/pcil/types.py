@@ -38,10 +38,28 @@ class Origin(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """States and the actions taken in them, row by row: `obs[i]` is where `action[i]` was taken."""
+    """Steps, all that a reward is ever given: `action` was taken in `obs` and led to `next_obs`.
 
-    obs: Float[Any, "batch obs"]
-    action: Float[Any, "batch action"]
+    The leading axes are `[T]` for an episode, in the order of time, and `[rows, n]` for windows of `n` steps in a row.
+    """
+
+    obs: Float[Any, "*steps obs"]
+    action: Float[Any, "*steps action"]
+    next_obs: Float[Any, "*steps obs"]
+    discount: Float[Any, "*steps"] | None = None
+    """That of `Window`; None where the steps are no windows."""
+    episode_id: Int[Any, " rows"] | None = None
+    """That of `Window`; None where the steps are no windows."""
+
+    @classmethod
+    def of(cls, obs: Float[Any, "*batch states obs"], action: Float[Any, "*batch n action"], *windows: Any) -> Batch:
+        """The steps between `n + 1` states in a row; `windows` are `discount` and `episode_id`."""
+        return cls(obs[..., :-1, :], action, obs[..., 1:, :], *windows)
+
+    @property
+    def first(self) -> Batch:
+        """The first step of each window."""
+        return Batch(self.obs[:, 0], self.action[:, 0], self.next_obs[:, 0])
 
 
 class Window(NamedTuple):
@@ -56,7 +74,7 @@ class Window(NamedTuple):
     action: Float[Any, "batch n action"]
     reward: Float[Any, "batch n"]
     discount: Float[Any, "batch n"]
-    number: Int[Any, " batch"]
+    episode_id: Int[Any, " batch"]
     """Which episode each window is from, counted from 0 over all that were ever added."""
 
 

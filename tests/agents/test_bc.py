@@ -60,7 +60,7 @@ def test_a_run_clones_the_optimal_policy_without_a_step_in_the_environment(
     demos = save_point_mass_demos(tmp_path)
     played = []
     monkeypatch.setattr(loop, "play", lambda *_: played.append(1))
-    result = runs.execute(small_bc(demos), tmp_path / "run", runs.Silent())
+    result = runs.execute(small_bc(demos), tmp_path / "run")
     assert not played and (tmp_path / "run" / "eval.csv").read_text().count("\n") == 1 + 3 * 2
     recorded = runs.Demonstrations.load(demos)
     error = load_policy(tmp_path / "run")(recorded.obs) - recorded.action

@@ -101,7 +101,7 @@ def trained_on(task: str, folder: Path, frames: int = 1200) -> loop.State:
     agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05)
     run = small_run("expert", task, frames=frames, random_frames=frames, evaluate_every=frames, agent=agent, update_every=1)
     folder.mkdir()
-    return loop.train_loop(run, folder, (), runs.Silent())
+    return loop.train_loop(run, folder, ())
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5])
@@ -124,7 +124,7 @@ def test_the_task_reward_agent_solves_the_point_mass(tmp_path: Path) -> None:
     """Within 10% of the optimal policy's return from the same starts; the trunk's normalisation blurs the last stretch."""
     agent = narrow(DrQV2(), hidden=64, learning_rate=1e-3, batch_size=64)
     run = small_run("expert", frames=6000, evaluate_every=6000, evaluate_episodes=10, agent=agent)
-    result = runs.execute(run, tmp_path / "run", runs.Silent())
+    result = runs.execute(run, tmp_path / "run")
     starts = [episode_seed(run.seed, Stream.EVALUATE, i) for i in range(run.evaluate_episodes)]
     best = np.mean([optimal_return(envs.make(run.task), start) for start in starts])
     assert result.final_return > 0.9 * best
@@ -143,7 +143,7 @@ def optimal_return(env: gymnasium.Env, seed: int) -> float:
 
 def test_the_actor_that_leaves_acts_on_plain_observations() -> None:
     """Large units, far from zero: what acts is the network on standardised observations."""
-    agent = dataclasses.replace(AGENT, standardise=True)
+    agent = dataclasses.replace(AGENT, normalize_observations=True)
     state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
     window = window._replace(obs=window.obs * jnp.array([[[1.0, 30.0, 0.01]]]) + jnp.array([[[0.0, -50.0, 2.0]]]))
     seen = window.obs.reshape(-1, SPEC.obs_dim)

@@ -81,13 +81,13 @@ def naive(nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, 
 
     losses = {"critic_loss": critic_loss(nets["critic"])}
     slope = jax.grad(critic_loss)(nets["critic"])
-    nets["critic"], *nets["critic moments"] = adam(nets["critic"], slope, *nets["critic moments"], count)
+    nets["critic"], *nets["critic opt_state"] = adam(nets["critic"], slope, *nets["critic opt_state"], count)
 
     def actor_loss(actor: Any) -> Any:
         return -jnp.mean(jnp.minimum(*worth(nets["critic"], s0, noisy(actor, s0, actor_noise))))
 
     losses["actor_loss"], slope = jax.value_and_grad(actor_loss)(nets["actor"])
-    nets["actor"], *nets["actor moments"] = adam(nets["actor"], slope, *nets["actor moments"], count)
+    nets["actor"], *nets["actor opt_state"] = adam(nets["actor"], slope, *nets["actor opt_state"], count)
     nets["slow"] = jax.tree.map(lambda slow, fast: 0.8 * slow + 0.2 * fast, nets["slow"], nets["critic"])
     return nets, losses
 
@@ -98,7 +98,7 @@ def close(got: Any, expected: Any, name: str) -> None:
 
 
 def test_three_updates_equal_the_definitions_in_float64() -> None:
-    """At three steps of the noise's schedule; Adam's first moments show each gradient's size, which its first step hides."""
+    """At three steps of the noise's schedule; Adam's first opt_state show each gradient's size, which its first step hides."""
     state = AGENT.init(SPEC, key=jax.random.key(0))
     steps, keys = (0, 500, 5000), [jax.random.key(10 + i) for i in range(3)]
     draws = [jax.random.normal(key, (2, 32, 2)) for key in keys]
@@ -111,18 +111,18 @@ def test_three_updates_equal_the_definitions_in_float64() -> None:
         double = lambda tree: jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float64), tree)  # noqa: E731
         nets = {"actor": double(state.actor), "critic": double(state.critic), "slow": double(state.critic)}
         for name in ("actor", "critic"):
-            nets[f"{name} moments"] = [jax.tree.map(jnp.zeros_like, nets[name]) for _ in range(2)]
+            nets[f"{name} opt_state"] = [jax.tree.map(jnp.zeros_like, nets[name]) for _ in range(2)]
         for i, (after, metrics) in enumerate(got):
             noise = np.clip(DEVIATION[steps[i]] * np.asarray(draws[i], np.float64), -0.3, 0.3)
             nets, losses = naive(nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1))
             for name, value in losses.items():
                 assert float(metrics[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), (i, name)
-            for name, network, moments in (
-                ("critic", after.critic, after.critic_moments),
-                ("actor", after.actor, after.actor_moments),
+            for name, network, opt_state in (
+                ("critic", after.critic, after.critic_opt_state),
+                ("actor", after.actor, after.actor_opt_state),
             ):
                 close(network, nets[name], f"{name} of update {i}")
-                close([moments[0].mu, moments[0].nu], nets[f"{name} moments"], f"moments of the {name} of update {i}")
+                close([opt_state[0].mu, opt_state[0].nu], nets[f"{name} opt_state"], f"opt_state of the {name} of update {i}")
             close(after.critic_target, nets["slow"], f"slow critic of update {i}")
 
 

@@ -243,6 +243,6 @@ def test_without_deepmind_control_all_else_works(tmp_path: Path, capsys: pytest.
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metadata, "version", version)
-        runs.execute(small_run("expert", frames=150), tmp_path / "run", runs.Silent())
+        runs.execute(small_run("expert", frames=150), tmp_path / "run")
     versions = json.loads((tmp_path / "run" / "run.json").read_text())["versions"]
     assert versions["jax"] == real("jax") and "dm-control" not in versions

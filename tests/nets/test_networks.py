@@ -30,7 +30,7 @@ from pcil.nets.networks import (
     unit_sphere,
     unscaled,
 )
-from pcil.nets.noise import ACTION_MARGIN, LinearSchedule, normal_steps, perturb
+from pcil.nets.noise import ACTION_MARGIN, LinearSchedule, add_noise, normal_steps
 from pcil.nets.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=50)
@@ -248,11 +248,11 @@ def test_the_schedule_never_turns_back() -> None:
 @given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-6, 6)), min_size=4, max_size=4))
 def test_a_noisy_action_is_the_sum_clamped_to_the_margin(pairs: list[tuple[float, float]]) -> None:
     mean, noise = (np.array(column, np.float32) for column in zip(*pairs, strict=True))
-    host = perturb(mean, noise, np)
+    host = add_noise(mean, noise, np)
     assert host.dtype == np.float32
     limit = np.float32(1 - ACTION_MARGIN)
     np.testing.assert_array_equal(host, np.minimum(np.maximum(mean + noise, -limit), limit))
-    compiled = np.asarray(perturb(jnp.asarray(mean), jnp.asarray(noise)))
+    compiled = np.asarray(add_noise(jnp.asarray(mean), jnp.asarray(noise)))
     np.testing.assert_allclose(compiled, host, rtol=0, atol=5e-7)
     assert np.abs(compiled).max() < 1
 
@@ -260,7 +260,7 @@ def test_a_noisy_action_is_the_sum_clamped_to_the_margin(pairs: list[tuple[float
 @pytest.mark.parametrize("noise", [0.0, 0.3, -0.9, 5.0, -5.0])
 def test_the_clamp_passes_the_gradient_straight_through(noise: float) -> None:
     mean = jnp.array([[0.5, -0.5, 0.999]])
-    to_mean, to_noise = jax.grad(lambda m, e: jnp.sum(perturb(m, e)), (0, 1))(mean, jnp.full((1, 3), noise))
+    to_mean, to_noise = jax.grad(lambda m, e: jnp.sum(add_noise(m, e)), (0, 1))(mean, jnp.full((1, 3), noise))
     np.testing.assert_array_equal(to_mean, 1)
     np.testing.assert_array_equal(to_noise, 1)
 
@@ -271,14 +271,14 @@ def test_the_clamp_passes_the_gradient_straight_through(noise: float) -> None:
 def test_three_steps_are_those_of_adam_written_out() -> None:
     """Kingma and Ba 2015, Algorithm 1, with its default betas and epsilon, in float64."""
     rng, network = np.random.default_rng(0), small_mlp()
-    weight, moments = np.asarray(network.weights[0], np.float64), adam_init(network)
+    weight, opt_state = np.asarray(network.weights[0], np.float64), adam_init(network)
     mean, square = np.zeros_like(weight), np.zeros_like(weight)
     for step in (1, 2, 3):
         gradient = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), jnp.float32), network)
         slope = np.asarray(gradient.weights[0], np.float64)
         mean, square = 0.9 * mean + 0.1 * slope, 0.999 * square + 0.001 * slope**2
         weight = weight - 1e-2 * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
-        network, moments = adam_step(network, gradient, moments, 1e-2)
+        network, opt_state = adam_step(network, gradient, opt_state, 1e-2)
     np.testing.assert_allclose(network.weights[0], weight, rtol=0, atol=1e-6)
 
 

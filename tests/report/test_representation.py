@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,7 +23,7 @@ from pcil.rewards import DAC, PCIL
 from pcil.training import learner, runs
 from pcil.training.config import Run
 from pcil.types import Episode
-from small import narrow, random_batch, save_point_mass_demos, small_run
+from small import narrow, random_batch, save_point_mass_demos, small_run, staying
 
 
 def embed(obs: Any) -> Any:
@@ -38,9 +37,9 @@ def embed(obs: Any) -> Any:
 def test_pcils_representation_is_what_its_reward_compares() -> None:
     settings, demos = narrow(PCIL(compare="mean")), random_batch(50, 3, 2)
     state, steps = settings.init([demos], embed, key=jax.random.key(0)), random_batch(40, 3, 2, seed=1)
-    seen = settings.representation(state, jnp.asarray(steps.obs), jnp.asarray(steps.action), embed)
-    anchors = settings.representation(state, state.reference, jnp.zeros((32, 2)), embed)
-    reward = settings.reward(state, jnp.asarray(steps.obs), jnp.asarray(steps.action), embed, key=jax.random.key(1))
+    seen = settings.representation(state, steps, embed)
+    anchors = settings.representation(state, state.reference, embed)
+    reward = settings.reward(state, steps, embed, key=jax.random.key(1))
     assert seen.shape == (40, 4) and np.allclose(np.linalg.norm(seen, axis=1), 1, atol=1e-5)
     assert np.allclose(seen @ anchors.mean(axis=0), reward, atol=1e-5)
 
@@ -49,12 +48,11 @@ def test_pcils_representation_is_what_its_reward_compares() -> None:
 def test_dacs_representation_is_one_linear_layer_from_its_logit(inputs: str) -> None:
     settings, demos = narrow(DAC(inputs=inputs)), random_batch(50, 3, 2)
     state, steps = settings.init([demos], embed, key=jax.random.key(0)), random_batch(40, 3, 2, seed=1)
-    obs, action = jnp.asarray(steps.obs), jnp.asarray(steps.action)
-    seen = settings.representation(state, obs, action, embed)
+    seen = settings.representation(state, steps, embed)
     last = state.discriminator
     logit = (seen @ last.weights[-1])[:, 0] + last.biases[-1]
     assert seen.shape == (40, 16) and float(seen.min()) == 0 < float(seen.max())
-    assert np.allclose(logit, settings.reward(state, obs, action, embed, key=jax.random.key(1)), atol=1e-5)
+    assert np.allclose(logit, settings.reward(state, steps, embed, key=jax.random.key(1)), atol=1e-5)
 
 
 # --- Whole runs ---
@@ -66,7 +64,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("runs")
     demos = save_point_mass_demos(root / "demos")
     for method in ("pcil", "dac", "expert"):
-        runs.execute(small_run(method, demos=demos if method != "expert" else None), root / method, runs.Silent())
+        runs.execute(small_run(method, demos=demos if method != "expert" else None), root / method)
     return root
 
 
@@ -98,13 +96,13 @@ def test_the_transitions_are_those_of_the_newest_networks(
 ) -> None:
     """The distances follow from the finished run's own state; nothing learns while the episode is played."""
     kept: dict[str, Any] = {}
-    plain = representation.loop.play
+    plain = representation.play
 
-    def watched(run: Run, env: Any, spec: Any, state: Any) -> Episode:
-        kept["state"], kept["episode"] = state, plain(run, env, spec, state)
-        return kept["episode"]
+    def watched(run: Run, environments: Any, spec: Any, state: Any, **options: Any) -> list[Episode]:
+        kept["state"], kept["episodes"] = state, plain(run, environments, spec, state, **options)
+        return kept["episodes"]
 
-    monkeypatch.setattr(representation.loop, "play", watched)
+    monkeypatch.setattr(representation, "play", watched)
     monkeypatch.setattr(learner, "update", lambda *arguments: pytest.fail("an update"))
     name = ("toy/point_mass-v0", "pcil", "default", 1)
     dots = representation.transitions(found.sources[name], next(point for point in found.points if point[:4] == name))
@@ -113,16 +111,16 @@ def test_the_transitions_are_those_of_the_newest_networks(
 
     def look(obs: np.ndarray) -> np.ndarray:
         trunk = learner.frozen_embed(run.learner, state.agent)
-        return np.asarray(run.reward.representation(state.reward, jnp.asarray(obs), jnp.zeros((len(obs), 2)), trunk))
+        return np.asarray(run.reward.representation(state.reward, staying(obs, np.zeros((len(obs), 2), np.float32)), trunk))
 
     rng = seeds.rng(run.seed, seeds.Stream.SAMPLE, kept["state"].counters.episodes - 1)
     states = np.concatenate([episode.obs[1:] for episode in Demonstrations.load(run.demos).episodes])
     expert = look(states[rng.permutation(len(states))[:128]])
     order = rng.permutation(50)
-    agent = look(kept["episode"].obs[1:][order])
+    agent = look(kept["episodes"][0].obs[1:][order])
     distances = np.linalg.norm(np.concatenate([expert, agent]) - expert.mean(axis=0), axis=1)
     assert [dot.distance for dot in dots] == pytest.approx(distances.tolist(), rel=1e-3, abs=1e-5)
-    assert [dot.reward for dot in dots[128:]] == pytest.approx(kept["episode"].reward[order].tolist(), rel=1e-3)
+    assert [dot.reward for dot in dots[128:]] == pytest.approx(kept["episodes"][0].reward[order].tolist(), rel=1e-3)
 
 
 def test_a_run_is_made_again_from_its_description(trained: Path) -> None:

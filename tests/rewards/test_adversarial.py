@@ -11,7 +11,7 @@ import pytest
 
 from pcil.nets.networks import MLP
 from pcil.rewards.adversarial import DAC, DiscriminatorState
-from small import narrow, random_batch, windows
+from small import batches, narrow, random_batch, staying
 
 SETTINGS = narrow(DAC())
 
@@ -21,7 +21,7 @@ def test_reward_is_the_logit_even_where_the_sigmoid_saturates() -> None:
     discriminator = MLP((jnp.ones((1, 1)), jnp.ones((1, 1))), (jnp.zeros(1), jnp.zeros(1)))
     state = DiscriminatorState(discriminator, None)
     obs = jnp.array([[0.0], [3.0], [200.0]])
-    assert np.allclose(SETTINGS.reward(state, obs, obs, lambda x: x, key=jax.random.key(0)), [0.0, 3.0, 200.0])
+    assert np.allclose(SETTINGS.reward(state, staying(obs, obs), lambda x: x, key=jax.random.key(0)), [0.0, 3.0, 200.0])
 
 
 def test_loss_equals_a_naive_one() -> None:
@@ -40,12 +40,12 @@ def test_loss_equals_a_naive_one() -> None:
 def test_penalty_keeps_the_slope_near_one() -> None:
     """Without it the logits of separable data grow without bound."""
     expert, agent = random_batch(33, 5, 1, 1), random_batch(33, 5, 1, 2)
-    expert = expert._replace(obs=expert.obs + 3)
+    expert = staying(expert.obs + 3, expert.action)
     gaps = []
     for penalty in (0.0, 10.0):
         settings = dataclasses.replace(SETTINGS, penalty=penalty, learning_rate=1e-2)
         state = settings.init([expert], lambda x: x, key=jax.random.key(0))
-        pair = windows(expert), windows(agent)
+        pair = batches(expert), batches(agent)
         update = jax.jit(lambda s, k, settings=settings, pair=pair: settings.update(s, *pair, lambda x: x, key=k))
         for i in range(150):
             state, metrics = update(state, jax.random.key(i))

@@ -15,8 +15,8 @@ import pytest
 from pcil.nets.networks import Trunk
 from pcil.rewards import REWARDS, Reward, label
 from pcil.training import checkpoint, presets
-from pcil.types import Batch, Window
-from small import narrow, random_batch, windows
+from pcil.types import Batch
+from small import batches, narrow, random_batch, staying
 
 FEATURES = 5
 
@@ -24,9 +24,9 @@ FEATURES = 5
 embed = Trunk.init(4, FEATURES, key=jax.random.key(3))
 
 
-EXPERT = Batch(random_batch(200, 4, 2, seed=1).obs * 0.3 + 1.0, random_batch(200, 4, 2, seed=1).action)
-AGENT = Batch(random_batch(200, 4, 2, seed=2).obs * 0.3 - 1.0, random_batch(200, 4, 2, seed=2).action)
-DEMOS = [Batch(EXPERT.obs[i : i + 100], EXPERT.action[i : i + 100]) for i in (0, 100)]
+EXPERT = staying(random_batch(200, 4, 2, seed=1).obs * 0.3 + 1.0, random_batch(200, 4, 2, seed=1).action)
+AGENT = staying(random_batch(200, 4, 2, seed=2).obs * 0.3 - 1.0, random_batch(200, 4, 2, seed=2).action)
+DEMOS = [staying(EXPERT.obs[i : i + 100], EXPERT.action[i : i + 100]) for i in (0, 100)]
 
 
 RUNS = [presets.make("walker_walk", method) for method in presets.METHODS]
@@ -39,15 +39,15 @@ CASES |= {
 }
 
 
-def rows(batch: Batch, start: int, size: int, span: int = 1) -> Window:
+def rows(batch: Batch, start: int, size: int, span: int = 1) -> Batch:
     """`size` windows of the batch from a start on; each ten of the batch are from another episode."""
-    every = windows(batch, span)
-    every = every._replace(number=np.arange(len(every.number), dtype=np.int32) // 10)
-    return Window(*(array[start : start + size] for array in every))
+    every = batches(batch, span)
+    every = every._replace(episode_id=jnp.arange(len(every.obs)) // 10)
+    return Batch(*(array[start : start + size] for array in every))
 
 
 def scaled(batch: Batch, scale: float) -> Batch:
-    return Batch(batch.obs * np.float32(scale), batch.action)
+    return staying(batch.obs * np.float32(scale), batch.action)
 
 
 @pytest.fixture(params=list(CASES), scope="module")
@@ -72,11 +72,11 @@ def trained(settings: Reward) -> Any:
 
 
 def rewards_of(settings: Reward, state: Any, batch: Batch) -> np.ndarray:
-    return np.asarray(settings.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), embed, key=jax.random.key(9)))
+    return np.asarray(settings.reward(state, Batch(*map(jnp.asarray, batch[:3])), embed, key=jax.random.key(9)))
 
 
 def test_shape_dtype_and_finite(settings: Reward, trained: Any) -> None:
-    got = rewards_of(settings, trained, Batch(AGENT.obs[:17], AGENT.action[:17]))
+    got = rewards_of(settings, trained, staying(AGENT.obs[:17], AGENT.action[:17]))
     assert got.shape == (17,) and got.dtype == np.float32 and np.isfinite(got).all()
 
 
@@ -91,8 +91,9 @@ def test_finite_under_extreme_inputs(settings: Reward, scale: float) -> None:
 
 
 def test_jit_equals_no_jit(settings: Reward, trained: Any) -> None:
-    obs, action, key = jnp.asarray(AGENT.obs), jnp.asarray(AGENT.action), jax.random.key(9)
-    compiled = jax.jit(lambda state, o, a: settings.reward(state, o, a, embed, key=key))(trained, obs, action)
+    compiled = jax.jit(
+        lambda state, batch: settings.reward(state, Batch(*map(jnp.asarray, batch[:3])), embed, key=jax.random.key(9))
+    )(trained, AGENT)
     assert np.allclose(compiled, rewards_of(settings, trained, AGENT), atol=1e-5)
 
 
@@ -118,6 +119,43 @@ def test_an_update_learns_from_the_first_steps_of_longer_windows_alone(case: str
     )
     assert all(np.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(*map(jax.tree.leaves, (short, long)), strict=True))
     assert not all(np.allclose(a, b, rtol=1e-5, atol=1e-7) for a, b in zip(*map(jax.tree.leaves, (short, late)), strict=True))
+
+
+WITH_INPUTS = {
+    f"{name} of {inputs}": dataclasses.replace(CASES[name], inputs=inputs)
+    for name, every in {"pcil": 3, "pcil-gail": 3, "dac": 3, "sil": 3, "pwil": 2}.items()
+    for inputs in ("state", "state-action", "transition")[:every]
+}
+
+
+@pytest.mark.parametrize("case", [*WITH_INPUTS, "tcn", "potil"])
+def test_init_update_and_reward_are_functions_of_the_same_inputs(case: str) -> None:
+    """Where the state before a step, its action or the state after it is another one, all three give another result if it is
+    among the inputs, and the same to the last bit if it is not."""
+    settings: Any = (CASES | WITH_INPUTS)[case]
+    inputs = getattr(settings, "inputs", "state")
+    keeps = settings.scope == "episode" or case.startswith(("pcil of", "tcn"))  # demonstrations in its state from the first
+    read = {"state": {"next_obs"}, "state-action": {"obs", "action"}, "transition": {"obs", "next_obs"}}[inputs]
+    learns = settings.batch_size > 0 and case != "tcn"  # which compares states of a window, whose obs and next_obs overlap
+    first, second, agent = (
+        Batch(*(jnp.asarray(array + shift) for array in batch[:3])) for batch, shift in ((EXPERT, 0), (EXPERT, 0.5), (AGENT, 0))
+    )
+    windows = [
+        Batch(*(array[:32, None] for array in side[:3]), jnp.ones((32, 1)), jnp.zeros(32, int)) for side in (first, AGENT)
+    ]
+    given = settings.init([first], embed, key=jax.random.key(0))
+    for name in ("obs", "action", "next_obs"):
+        of = lambda batch, new, name=name: batch._replace(**{name: getattr(new, name)})  # noqa: E731
+        state = settings.init([of(first, second)], embed, key=jax.random.key(0))
+        paid = [settings.reward(s, agent, embed, key=jax.random.key(1)) for s in (given, state)]
+        assert np.array_equal(*paid) == (name not in read or not keeps), f"init, {name}"
+        paid = [settings.reward(given, batch, embed, key=jax.random.key(1)) for batch in (agent, of(agent, second))]
+        assert np.array_equal(*paid) == (name not in read), f"reward, {name}"
+        if learns:
+            other = [of(window, Batch(*(array[:32, None] for array in second[:3]))) for window in windows]
+            states = [settings.update(given, *both, embed, key=jax.random.key(1))[0] for both in (windows, other)]
+            paid = [settings.reward(s, agent, embed, key=jax.random.key(1)) for s in states]
+            assert np.array_equal(*paid) == (name not in read), f"update, {name}"
 
 
 def test_inputs_unchanged(settings: Reward, trained: Any) -> None:
@@ -148,25 +186,25 @@ def test_only_rewards_of_whole_episodes_depend_on_other_steps(settings: Reward, 
     if settings.scope == "episode":
         fresh, changed = settings.init(DEMOS, embed, key=jax.random.key(0)), AGENT.obs.copy()
         changed[:50] = EXPERT.obs[:50]
-        other = rewards_of(settings, fresh, Batch(changed, AGENT.action))
+        other = rewards_of(settings, fresh, staying(changed, AGENT.action))
         assert not np.allclose(other[50:], rewards_of(settings, fresh, AGENT)[50:], rtol=1e-3, atol=0)
         return
     period = 2 * max(settings.batch_size, 1)
     swapped = np.roll(np.arange(200)[: 3 * period], period)
-    moved = Batch(AGENT.obs[swapped], AGENT.action[swapped])
+    moved = staying(AGENT.obs[swapped], AGENT.action[swapped])
     assert np.allclose(rewards_of(settings, trained, moved), rewards_of(settings, trained, AGENT)[swapped], atol=1e-5)
 
 
 def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trained: Any) -> None:
     """Of a reward that says so, whatever the states are there; one that doesn't is never given any."""
     steps, behind = np.s_[:70], np.full((30, 2), np.nan, np.float32)
-    episode = Batch(AGENT.obs[steps], AGENT.action[steps])
-    padded = Batch(AGENT.obs[:100], np.concatenate([episode.action, behind]))
+    episode = staying(AGENT.obs[steps], AGENT.action[steps])
+    padded = staying(AGENT.obs[:100], np.concatenate([episode.action, behind]))
     whole = settings.scope == "episode"
     assert settings.takes_padding == whole
     if whole:
         after = functools.partial(settings.after_episode, trained, embed=embed, key=jax.random.key(9))
-        states = [after(obs=jnp.asarray(given.obs), action=jnp.asarray(given.action)) for given in (episode, padded)]
+        states = [after(batch=Batch(*map(jnp.asarray, given[:3]))) for given in (episode, padded)]
         assert all(np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, states), strict=True))
         got, expected = (rewards_of(settings, states[0], given)[steps] for given in (padded, episode))
         assert np.allclose(got, expected, rtol=1e-4, atol=1e-6) and np.ptp(expected) > 0
@@ -175,10 +213,8 @@ def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trai
 def test_a_task_reward_of_weight_0_leaves_no_trace(settings: Reward, trained: Any) -> None:
     """Whatever it is: 0 times NaN would be NaN."""
     settings = dataclasses.replace(settings, task_weight=0.0)
-    obs, action = jnp.asarray(AGENT.obs[:5][None]), jnp.asarray(AGENT.action[:4][None])
-    got = [
-        label(settings, trained, obs, action, jnp.full((1, 4), true), embed, key=jax.random.key(9)) for true in (0.0, jnp.nan)
-    ]
+    batch = Batch.of(jnp.asarray(AGENT.obs[:5][None]), jnp.asarray(AGENT.action[:4][None]))
+    got = [label(settings, trained, batch, jnp.full((1, 4), true), embed, key=jax.random.key(9)) for true in (0.0, jnp.nan)]
     assert np.isfinite(got[0]).all() and np.array_equal(*got)
 
 
@@ -202,7 +238,8 @@ def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) ->
     rng = np.random.default_rng(0)
     obs, action = rng.standard_normal((3, 5, 4), dtype=np.float32), rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32)
     true = rng.standard_normal((3, 4), dtype=np.float32)
-    got = label(settings, trained, jnp.asarray(obs), jnp.asarray(action), jnp.asarray(true), embed, key=jax.random.key(9))
-    seen = obs[:, 1:] if settings.reads == "next_obs" else obs[:, :-1]
-    learned = rewards_of(settings, trained, Batch(seen.reshape(12, 4), action.reshape(12, 2))).reshape(3, 4)
+    batch = Batch.of(jnp.asarray(obs), jnp.asarray(action))
+    got = label(settings, trained, batch, jnp.asarray(true), embed, key=jax.random.key(9))
+    steps = obs[:, :-1].reshape(12, 4), action.reshape(12, 2), obs[:, 1:].reshape(12, 4)
+    learned = rewards_of(settings, trained, Batch(*steps)).reshape(3, 4)
     assert np.allclose(got, learned + 0.7 * true, atol=1e-5)

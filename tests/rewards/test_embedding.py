@@ -16,8 +16,8 @@ from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards import PCIL, TCN, Reward
 from pcil.rewards.embedding import Classifier, EmbeddingState, embedding_reward, similarity
 from pcil.training import presets
-from pcil.types import Window
-from small import narrow, random_batch, windows
+from pcil.types import Batch
+from small import batches, narrow, random_batch, staying
 
 BOTH = [narrow(PCIL(head="gail")), narrow(TCN(head="gail"))]
 
@@ -27,7 +27,7 @@ def itself(obs: jnp.ndarray) -> jnp.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def update(settings: PCIL | TCN, state: EmbeddingState, expert: Window, agent: Window, key: Any) -> tuple[EmbeddingState, Any]:
+def update(settings: PCIL | TCN, state: EmbeddingState, expert: Batch, agent: Batch, key: Any) -> tuple[EmbeddingState, Any]:
     return settings.update(state, expert, agent, itself, key=key)
 
 
@@ -46,9 +46,10 @@ def test_the_logit_is_the_reward_even_where_the_sigmoid_saturates() -> None:
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
     classifier = Classifier(MLP((jnp.array([[300.0], [0.0]]),), (jnp.array([-100.0]),)), None)
-    state = EmbeddingState(encoder, None, jnp.ones((4, 2)), classifier)
+    state = EmbeddingState(encoder, None, staying(jnp.ones((4, 2)), jnp.ones((4, 1))), classifier)
     obs = jnp.array([[5.0, 0.0], [-2.0, 0.0], [3.0, 4.0]])
-    assert np.allclose(embedding_reward(state, obs, itself, "random"), [200.0, -400.0, 80.0], atol=1e-3)
+    got = embedding_reward(state, staying(obs, obs), itself, "state", "random")
+    assert np.allclose(got, [200.0, -400.0, 80.0], atol=1e-3)
 
 
 @pytest.mark.parametrize("settings", BOTH, ids=lambda s: type(s).__name__)
@@ -57,17 +58,20 @@ def test_the_classifier_takes_a_step_of_cross_entropy_with_label_1_for_the_exper
 
     Adam's first moment after one step is a tenth of the gradient.
     """
-    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    expert, agent = batches(random_batch(33, 6, 1, 1)), batches(random_batch(33, 6, 1, 2))
     state = settings.init([random_batch(99, 6, 1, 3)], itself, key=jax.random.key(0))
     after, metrics = update(settings, state, expert, agent, jax.random.key(1))
-    phi_e, phi_a = (np.asarray(unit_sphere(state.encoder(jnp.asarray(w.obs[:, 0]))), np.float64) for w in (expert, agent))
+    first = [
+        (w.next_obs if isinstance(settings, PCIL) else w.obs)[:, 0] for w in (expert, agent)
+    ]  # what the encoder learns from
+    phi_e, phi_a = (np.asarray(unit_sphere(state.encoder(obs)), np.float64) for obs in first)
     weight, bias = np.asarray(state.classifier.linear.weights[0], np.float64)[:, 0], float(state.classifier.linear.biases[0][0])
     d_e, d_a = (1 / (1 + np.exp(-(phi @ weight + bias))) for phi in (phi_e, phi_a))
     assert float(metrics["head_loss"]) == pytest.approx(-np.mean(np.log(d_e)) - np.mean(np.log(1 - d_a)), rel=1e-5)
     slope = ((d_e - 1) @ phi_e + d_a @ phi_a) / 32
-    first = optax.tree.get(after.classifier.moments, "mu")
-    assert np.allclose(first.weights[0][:, 0], slope / 10, atol=1e-7)
-    assert float(first.biases[0][0]) == pytest.approx((np.mean(d_e - 1) + np.mean(d_a)) / 10, abs=1e-7)
+    mean = optax.tree.get(after.classifier.opt_state, "mu")
+    assert np.allclose(mean.weights[0][:, 0], slope / 10, atol=1e-7)
+    assert float(mean.biases[0][0]) == pytest.approx((np.mean(d_e - 1) + np.mean(d_a)) / 10, abs=1e-7)
     moved = np.asarray(after.classifier.linear.weights[0][:, 0]) - weight
     assert np.allclose(moved, -settings.learning_rate * np.sign(slope), rtol=1e-2), "Adam's first step has the rate's length"
 
@@ -76,7 +80,7 @@ def test_the_classifier_takes_a_step_of_cross_entropy_with_label_1_for_the_exper
 def test_the_embedding_never_feels_the_head(settings: PCIL | TCN) -> None:
     """Three updates with either head leave the same encoder, bit for bit; only one of the two has a classifier."""
     demos = [random_batch(99, 6, 1, 3)]
-    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    expert, agent = batches(random_batch(33, 6, 1, 1)), batches(random_batch(33, 6, 1, 2))
     ends = []
     for head in ("gail", "similarity"):
         one = dataclasses.replace(settings, head=head)
@@ -85,7 +89,7 @@ def test_the_embedding_never_feels_the_head(settings: PCIL | TCN) -> None:
             state, _ = update(one, state, expert, agent, jax.random.key(i))
         ends.append(state)
     assert ends[0].classifier is not None and ends[1].classifier is None
-    for a, b in zip(*(jax.tree.leaves((end.encoder, end.moments)) for end in ends), strict=True):
+    for a, b in zip(*(jax.tree.leaves((end.encoder, end.opt_state)) for end in ends), strict=True):
         assert np.array_equal(a, b)
 
 

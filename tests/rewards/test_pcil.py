@@ -25,8 +25,8 @@ from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.pcil import PCIL, derangement, stages
 from pcil.training import learner
 from pcil.training.learner import frozen_embed
-from pcil.types import Batch, Spec, Window
-from small import narrow, random_batch, small_run, windows
+from pcil.types import Batch, Spec
+from small import batches, narrow, random_batch, small_run, staying, windows
 
 
 def features(seed: int, rows: int = 32, dim: int = 6) -> jnp.ndarray:
@@ -41,7 +41,7 @@ loss = jax.jit(PCIL.loss, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def update(settings: PCIL, state: EmbeddingState, expert: Window, agent: Window, *, key: Any) -> tuple[EmbeddingState, Any]:
+def update(settings: PCIL, state: EmbeddingState, expert: Batch, agent: Batch, *, key: Any) -> tuple[EmbeddingState, Any]:
     """One update where the features are the observations."""
     return settings.update(state, expert, agent, lambda obs: obs, key=key)
 
@@ -114,7 +114,7 @@ def test_reward_lies_between_minus_one_and_one(compare: str) -> None:
     settings = dataclasses.replace(SETTINGS, compare=compare)
     batch = random_batch(300, 6, 1)
     state = settings.init([batch], lambda obs: obs * 50, key=jax.random.key(0))
-    got = settings.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), lambda obs: obs * 50, key=jax.random.key(1))
+    got = settings.reward(state, batch, lambda obs: obs * 50, key=jax.random.key(1))
     assert np.abs(got).max() <= 1 + 1e-6 and np.std(got) > 0
 
 
@@ -127,9 +127,9 @@ def test_embedding_has_a_quarter_of_the_width_and_four_layers() -> None:
 def test_an_update_draws_experts_together_and_pushes_the_agent_away() -> None:
     """The sign of Eq. 1 as corrected: the margin between positive and negative similarity grows."""
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-2, penalty=0.0)
-    demo, agent = random_batch(33, 6, 1, 1), windows(random_batch(33, 6, 1, 2))
-    demo = Batch(demo.obs + 0.5, demo.action)
-    expert = windows(demo)
+    demo, agent = random_batch(33, 6, 1, 1), batches(random_batch(33, 6, 1, 2))
+    demo = staying(demo.obs + 0.5, demo.action)
+    expert = batches(demo)
     state = settings.init([demo], lambda obs: obs, key=jax.random.key(0))
     margins = []
     for i in range(50):
@@ -139,10 +139,11 @@ def test_an_update_draws_experts_together_and_pushes_the_agent_away() -> None:
 
 
 def test_reference_is_the_last_expert_batch() -> None:
-    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    expert, agent = batches(random_batch(33, 6, 1, 1)), batches(random_batch(33, 6, 1, 2))
     state = SETTINGS.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
     after, _ = SETTINGS.update(state, expert, agent, lambda obs: obs, key=jax.random.key(1))
-    assert np.array_equal(after.reference, expert.obs[:, 0]) and not np.array_equal(state.reference, expert.obs[:, 0])
+    assert np.array_equal(after.reference.next_obs, expert.next_obs[:, 0])
+    assert not np.array_equal(state.reference.next_obs, expert.next_obs[:, 0])
 
 
 def test_the_penaltys_partner_is_the_batch_before_and_its_mixtures_are_of_expert_and_agent_rows() -> None:
@@ -150,7 +151,7 @@ def test_the_penaltys_partner_is_the_batch_before_and_its_mixtures_are_of_expert
 
     `u` is drawn with the second half of the update's key.
     """
-    pairs = [[windows(random_batch(33, 6, 1, seed)) for seed in (10 + i, 20 + i)] for i in range(2)]
+    pairs = [[batches(random_batch(33, 6, 1, seed)) for seed in (10 + i, 20 + i)] for i in range(2)]
     state = SETTINGS.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
 
     @jax.jit
@@ -163,13 +164,14 @@ def test_the_penaltys_partner_is_the_batch_before_and_its_mixtures_are_of_expert
     for i, (expert, agent) in enumerate(pairs):
         key, before = jax.random.key(5 + i), state
         state, metrics = update(SETTINGS, before, expert, agent, key=key)
-        of = functools.partial(slopes, before.encoder, expert.obs[:, 0], key=key)
-        expected = float(of(agent=agent.obs[:, 0], partner=before.reference))
+        of = functools.partial(slopes, before.encoder, expert.next_obs[:, 0], key=key)
+        partner = before.reference.next_obs
+        expected = float(of(agent=agent.next_obs[:, 0], partner=partner))
         assert float(metrics["penalty"]) == pytest.approx(expected, rel=1e-4)
-        others = (expert.obs[:, 0], before.reference), (agent.obs[:, 0], expert.obs[:, 0])
+        others = (expert.next_obs[:, 0], partner), (agent.next_obs[:, 0], expert.next_obs[:, 0])
         for rows, partner in others:
             assert float(of(agent=rows, partner=partner)) != pytest.approx(expected, rel=1e-3)
-        assert np.array_equal(state.reference, expert.obs[:, 0])
+        assert np.array_equal(state.reference.next_obs, expert.next_obs[:, 0])
 
 
 def test_no_anchor_is_its_own_positive() -> None:
@@ -195,7 +197,7 @@ def test_a_lazy_penalty_comes_at_every_so_many_updates_and_weighs_as_much_more()
 
 def test_updates_are_counted_by_the_state() -> None:
     lazy = dataclasses.replace(SETTINGS, penalty_every=2)
-    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    expert, agent = batches(random_batch(33, 6, 1, 1)), batches(random_batch(33, 6, 1, 2))
     state = lazy.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
     came = []
     for i in range(5):
@@ -258,7 +260,7 @@ def test_anchors_on_stages_add_their_weighted_loss_and_leave_the_experts_alone()
     settings, key = dataclasses.replace(SETTINGS, temperature=0.5, stages=3, stage_weight=0.25), jax.random.key(4)
     parts = features(1), features(2), features(3)
     number = np.random.default_rng(0).integers(0, 9, 32)
-    total, metrics = loss(settings, ENCODER, *parts, key=key, number=jnp.asarray(number))
+    total, metrics = loss(settings, ENCODER, *parts, key=key, episode_id=jnp.asarray(number))
     without, usual = loss(dataclasses.replace(settings, stages=0), ENCODER, *parts, key=key)
 
     phi_e, phi_a = (np.asarray(unit_sphere(ENCODER(x)), np.float64) for x in parts[:2])
@@ -276,12 +278,12 @@ def test_anchors_on_stages_add_their_weighted_loss_and_leave_the_experts_alone()
 
 
 def test_stages_come_from_the_agents_episodes_and_only_where_they_are_asked_for() -> None:
-    expert, agent = windows(random_batch(33, 6, 1, 1)), windows(random_batch(33, 6, 1, 2))
+    expert, agent = batches(random_batch(33, 6, 1, 1)), batches(random_batch(33, 6, 1, 2))
     mixed = np.arange(32, dtype=np.int32)
 
     def encoder_after(settings: PCIL, of_expert: np.ndarray, of_agent: np.ndarray) -> np.ndarray:
         state = settings.init([random_batch(99, 6, 1, 3)], lambda obs: obs, key=jax.random.key(0))
-        pair = expert._replace(number=of_expert), agent._replace(number=of_agent)
+        pair = expert._replace(episode_id=of_expert), agent._replace(episode_id=of_agent)
         return np.asarray(update(settings, state, *pair, key=jax.random.key(1))[0].encoder.weights[0])
 
     staged = dataclasses.replace(SETTINGS, stages=4)
@@ -295,12 +297,12 @@ def test_training_gathers_each_stage_and_parts_it_from_the_others() -> None:
     settings = dataclasses.replace(SETTINGS, stages=2, learning_rate=1e-2, penalty=0.0)
     demo, rows = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
     late = np.arange(33) % 2
-    agent = windows(rows._replace(obs=rows.obs + np.float32(1.5) * late[:, None].astype(np.float32)))
-    agent = agent._replace(number=late[:32].astype(np.int32))
+    agent = batches(staying(rows.obs + np.float32(1.5) * late[:, None].astype(np.float32), rows.action))
+    agent = agent._replace(episode_id=late[:32].astype(np.int32))
     state = settings.init([demo], lambda obs: obs, key=jax.random.key(0))
     for i in range(200):
-        state, metrics = update(settings, state, windows(demo), agent, key=jax.random.key(i))
-    z = np.asarray(unit_sphere(state.encoder(jnp.asarray(agent.obs[:, 0]))))
+        state, metrics = update(settings, state, batches(demo), agent, key=jax.random.key(i))
+    z = np.asarray(unit_sphere(state.encoder(jnp.asarray(agent.next_obs[:, 0]))))
     early, late = (z[late[:32] == which] for which in (0, 1))
     within = (np.mean(early @ early.T) + np.mean(late @ late.T)) / 2
     assert within > np.mean(early @ late.T) + 0.8
@@ -316,11 +318,11 @@ def test_with_a_task_weight_the_label_is_a_weighted_sum_by_hand() -> None:
     Paid 2 by the task with weight 0.5, it is labelled 0.6 + 1.
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
-    state = EmbeddingState(encoder, None, jnp.array([[1.0, 0.0]]), None)
+    state = EmbeddingState(encoder, None, staying(jnp.array([[1.0, 0.0]]), jnp.zeros((1, 1))), None)
     obs, action, paid = jnp.array([[0.0, 1.0], [3.0, 4.0], [-1.0, 0.0]]), jnp.zeros((2, 1)), jnp.array([2.0, -4.0])
     for weight, expected in ((0.5, [0.6 + 1, -1 - 2]), (0.0, [0.6, -1])):
         settings = dataclasses.replace(SETTINGS, task_weight=weight)
-        got = label(settings, state, obs, action, paid, lambda x: x, key=jax.random.key(0))
+        got = label(settings, state, Batch.of(obs, action), paid, lambda x: x, key=jax.random.key(0))
         assert np.allclose(got, expected, atol=1e-6)
 
 
@@ -344,12 +346,12 @@ def test_actions_make_no_difference() -> None:
     demo, seen = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
     learned = []
     for factor in (1, -1):
-        batches = [Batch(batch.obs, batch.action * factor) for batch in (demo, seen)]
-        state = SETTINGS.init(batches[:1], lambda obs: obs, key=jax.random.key(0))
-        state, _ = update(SETTINGS, state, *map(windows, batches), key=jax.random.key(1))
+        pair = [staying(batch.obs, batch.action * factor) for batch in (demo, seen)]
+        state = SETTINGS.init(pair[:1], lambda obs: obs, key=jax.random.key(0))
+        state, _ = update(SETTINGS, state, *map(batches, pair), key=jax.random.key(1))
         embed = {"embed": lambda obs: obs, "key": jax.random.key(2)}
-        paid = SETTINGS.reward(state, jnp.asarray(batches[1].obs), jnp.asarray(batches[1].action), **embed)
-        learned.append([*jax.tree.leaves(state), paid])
+        paid = SETTINGS.reward(state, pair[1], **embed)
+        learned.append([*jax.tree.leaves(state.encoder), paid])
     assert all(np.array_equal(one, other) for one, other in zip(*learned, strict=True))
 
 
@@ -362,6 +364,6 @@ def test_nothing_flows_into_the_agents_features() -> None:
     def loss(trained: object) -> jnp.ndarray:
         embed = frozen_embed(run.learner, trained)
         state = SETTINGS.init([batch], embed, key=jax.random.key(0))
-        return jnp.sum(SETTINGS.reward(state, jnp.asarray(batch.obs), jnp.asarray(batch.action), embed, key=jax.random.key(1)))
+        return jnp.sum(SETTINGS.reward(state, batch, embed, key=jax.random.key(1)))
 
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(jax.grad(loss, allow_int=True)(agent)) if leaf.dtype == np.float32)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from pcil.nets.networks import Trunk
 from pcil.rewards.pwil import PWIL, PWILState, greedy_distances, move
-from pcil.types import Batch, Window
-from small import random_batch, windows
+from pcil.types import Batch
+from small import batches, random_batch, staying
 
 GREEDY = jax.jit(greedy_distances)
 MOVE = jax.jit(move)
@@ -109,12 +109,12 @@ def test_distances_that_are_not_finite_end_too() -> None:
 
 
 @functools.partial(jax.jit, static_argnames="pwil")
-def reward(pwil: PWIL, state: PWILState, obs: jax.Array, action: jax.Array, embed: Any = EMBED) -> jax.Array:
-    return pwil.reward(state, obs, action, embed, key=KEY)
+def reward(pwil: PWIL, state: PWILState, batch: Batch, embed: Any = EMBED) -> jax.Array:
+    return pwil.reward(state, batch, embed, key=KEY)
 
 
 def reward_of(pwil: PWIL, demos: list[Batch], episode: Batch) -> np.ndarray:
-    return np.asarray(reward(pwil, pwil.init(demos, EMBED, key=KEY), episode.obs, episode.action))
+    return np.asarray(reward(pwil, pwil.init(demos, EMBED, key=KEY), episode))
 
 
 DEMOS = [random_batch(30, 3, 2, seed) for seed in (1, 2)]
@@ -133,11 +133,10 @@ def test_reward_is_the_papers_formula(inputs: Any) -> None:
     costs = np.array(naive_costs(atoms, points, 30))
     expected = 3 * np.exp(-2 * 30 / np.sqrt(5) * costs)
     assert np.allclose(reward_of(PWIL(inputs=inputs, alpha=3.0, beta=2.0), DEMOS, EPISODE), expected, rtol=1e-4)
-    assert PWIL(inputs=inputs).reads == ("obs" if inputs == "state-action" else "next_obs")
 
 
 def test_reward_lies_between_0_and_alpha_which_a_copy_of_the_demonstration_earns() -> None:
-    for demo in (random_batch(20, 3, 2, 7), Batch(np.tile(np.float32([[1, 2, 3]]), (20, 1)), np.zeros((20, 2), np.float32))):
+    for demo in (random_batch(20, 3, 2, 7), staying(np.tile(np.float32([[1, 2, 3]]), (20, 1)), np.zeros((20, 2), np.float32))):
         assert np.allclose(reward_of(PWIL(alpha=4.0), [demo], demo), 4)
     got = reward_of(PWIL(alpha=4.0), DEMOS, EPISODE)
     assert (got > 0).all() and (got <= 4).all()
@@ -146,14 +145,14 @@ def test_reward_lies_between_0_and_alpha_which_a_copy_of_the_demonstration_earns
 def test_a_step_is_paid_by_what_came_before_it_and_not_by_what_comes_after() -> None:
     changed = EPISODE.obs.copy()
     changed[20] += 1
-    one, two = reward_of(PWIL(), DEMOS, EPISODE), reward_of(PWIL(), DEMOS, Batch(changed, EPISODE.action))
+    one, two = reward_of(PWIL(), DEMOS, EPISODE), reward_of(PWIL(), DEMOS, staying(changed, EPISODE.action))
     assert np.array_equal(one[:20], two[:20]) and not np.allclose(one[20:], two[20:])
 
 
 def test_order_matters() -> None:
     """The same steps in another order: who comes first takes the nearest atoms."""
     order = np.random.default_rng(0).permutation(30)
-    shuffled = reward_of(PWIL(), DEMOS, Batch(EPISODE.obs[order], EPISODE.action[order]))
+    shuffled = reward_of(PWIL(), DEMOS, staying(EPISODE.obs[order], EPISODE.action[order]))
     assert not np.allclose(shuffled, reward_of(PWIL(), DEMOS, EPISODE)[order])
 
 
@@ -162,16 +161,16 @@ def test_units_and_origins_of_states_do_not_matter_and_constant_entries_stay_fin
 
     def other(batch: Batch) -> Batch:
         constant = np.full((len(batch.obs), 1), 0.1, np.float32)
-        return Batch(np.concatenate([batch.obs * unit + origin, constant], axis=1), batch.action)
+        return staying(np.concatenate([batch.obs * unit + origin, constant], axis=1), batch.action)
 
-    plain = Batch(np.pad(EPISODE.obs, ((0, 0), (0, 1))), EPISODE.action)
-    demos = [Batch(np.pad(demo.obs, ((0, 0), (0, 1))), demo.action) for demo in DEMOS]
+    plain = staying(np.pad(EPISODE.obs, ((0, 0), (0, 1))), EPISODE.action)
+    demos = [staying(np.pad(demo.obs, ((0, 0), (0, 1))), demo.action) for demo in DEMOS]
     got, expected = reward_of(PWIL(), [other(d) for d in DEMOS], other(EPISODE)), reward_of(PWIL(), demos, plain)
     assert np.isfinite(got).all() and np.allclose(got, expected, rtol=1e-2)
 
 
 def test_subsampling_takes_one_step_in_so_many_from_an_offset_of_each_demonstrations_own() -> None:
-    steps = Batch(np.arange(23, dtype=np.float32)[:, None], np.zeros((23, 1), np.float32))
+    steps = staying(np.arange(23, dtype=np.float32)[:, None], np.zeros((23, 1), np.float32))
     offsets = set()
     for seed in range(20):
         state = PWIL(subsampling=5).init([steps, steps], EMBED, key=jax.random.key(seed))
@@ -193,7 +192,7 @@ def test_slow_features_are_those_of_the_trunk_at_its_last_turn() -> None:
     """Until then those of the trunk at the start; the reward never sees the agent's trunk of now."""
     trunks = [Trunk.init(3, 6, key=jax.random.key(seed)) for seed in range(4)]
     pwil = PWIL(inputs="trunk", refresh=2)
-    nothing = Window(*(array[:0] for array in windows(EPISODE)))
+    nothing = Batch(*(array[:0] for array in batches(EPISODE)))
     state = pwil.init(DEMOS, trunks[0], key=KEY)
     expert = np.concatenate([demo.obs for demo in DEMOS])
 
@@ -204,9 +203,9 @@ def test_slow_features_are_those_of_the_trunk_at_its_last_turn() -> None:
     for updates, slow in enumerate([0, 0, 2, 2]):
         if updates:
             state, _ = pwil.update(state, nothing, nothing, trunks[updates], key=KEY)
-        got = reward(pwil, state, EPISODE.obs, EPISODE.action, trunks[updates])
+        got = reward(pwil, state, EPISODE, trunks[updates])
         assert np.allclose(got, expected(trunks[slow]), rtol=1e-3)
-    assert pwil.features == "actor"
+    assert pwil.trunk == "actor"
 
 
 def test_prefill_pays_alpha() -> None:

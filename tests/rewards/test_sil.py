@@ -15,8 +15,8 @@ from pcil.nets.networks import MLP, Trunk
 from pcil.rewards.sil import POTIL, SIL, Demos, SinkhornReward, SinkhornState, step_weights
 from pcil.training import learner
 from pcil.training.config import Run
-from pcil.types import Batch, Episode, Spec, Window
-from small import narrow, random_batch, small_run, windows
+from pcil.types import Batch, Episode, Spec
+from small import batches, narrow, random_batch, small_run, staying
 
 TRUNKS = [Trunk.init(3, 6, key=jax.random.key(seed)) for seed in range(4)]
 DEMOS = [random_batch(steps, 3, 2, seed) for seed, steps in enumerate((20, 12, 17))]
@@ -26,7 +26,7 @@ KEY = jax.random.key(0)
 
 @functools.partial(jax.jit, static_argnames="settings")
 def reward(settings: SinkhornReward, state: SinkhornState, batch: Batch, embed: Trunk, key: jax.Array) -> jax.Array:
-    return settings.reward(state, batch.obs, batch.action, embed, key=key)
+    return settings.reward(state, batch, embed, key=key)
 
 
 def naive_costs(x: np.ndarray, y: np.ndarray, epsilon: float = 0.01, rounds: int = 100) -> np.ndarray:
@@ -61,7 +61,7 @@ def test_sil_pays_minus_the_cost_to_one_random_demonstration(inputs: Any) -> Non
         (which,) = (i for i, costs in enumerate(expected) if np.allclose(got, costs, rtol=1e-3, atol=1e-6))
         met.add(which)
     assert met == {0, 1, 2}
-    assert sil.reads == ("obs" if inputs == "state-action" else "next_obs") and sil.features == "critic"
+    assert sil.trunk == "critic"
 
 
 @pytest.mark.parametrize("near", [0, 1, 2])
@@ -69,12 +69,12 @@ def test_potil_pays_minus_the_cost_to_the_nearest_demonstration(near: int) -> No
     """Nearest as a whole: the largest sum of rewards, not the largest reward at each step."""
     potil = POTIL()
     state = potil.init(DEMOS, TRUNKS[0], key=KEY)
-    episode = Batch(DEMOS[near].obs[:10] + 0.1, DEMOS[near].action[:10])
+    episode = staying(DEMOS[near].obs[:10] + 0.1, DEMOS[near].action[:10])
     costs = [naive_costs(TRUNKS[0](episode.obs, np), TRUNKS[0](demo.obs, np)) for demo in DEMOS]
     assert int(np.argmin([cost.sum() for cost in costs])) == near
     got = reward(potil, state, episode, TRUNKS[1], KEY)
     assert np.allclose(got, -costs[near], rtol=1e-3, atol=1e-6)
-    assert potil.features == "actor" and potil.reads == "next_obs"
+    assert potil.trunk == "actor"
 
 
 def test_an_episode_that_is_the_demonstration_costs_almost_nothing() -> None:
@@ -128,14 +128,14 @@ def test_steps_share_the_mass_and_rows_behind_them_have_none() -> None:
 class Free(POTIL):
     """Every episode costs nothing at all."""
 
-    def costs(self, state: Any, obs: Any, action: Any, embed: Any, *, key: Any) -> jax.Array:
-        return jnp.zeros(len(obs))
+    def costs(self, state: Any, batch: Any, embed: Any, *, key: Any) -> jax.Array:
+        return jnp.zeros(len(batch.obs))
 
 
 def test_a_first_episode_that_costs_nothing_leaves_a_finite_scale() -> None:
     """As if it had cost a millionth."""
     state = SinkhornState(Demos.of(DEMOS), jnp.zeros(()), None)
-    after = Free().after_episode(state, *map(jnp.asarray, EPISODE), TRUNKS[0], key=KEY)
+    after = Free().after_episode(state, EPISODE, TRUNKS[0], key=KEY)
     assert float(after.scale) == pytest.approx(10 / 1e-6)
 
 
@@ -174,15 +174,15 @@ def test_the_critics_gradient_is_that_of_the_cost_with_the_plan_held_fixed() -> 
         assert slope == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3)
 
 
-def pair(rows: int = 32) -> tuple[Window, Window]:
+def pair(rows: int = 32) -> tuple[Batch, Batch]:
     """An expert and an agent that live apart, but not far."""
     expert, agent = random_batch(rows + 1, 3, 2, 1), random_batch(rows + 1, 3, 2, 2)
-    return windows(expert._replace(obs=expert.obs + 1)), windows(agent)
+    return batches(staying(expert.obs + 1, expert.action)), batches(agent)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def update(
-    settings: SinkhornReward, state: SinkhornState, expert: Window, agent: Window, embed: Trunk
+    settings: SinkhornReward, state: SinkhornState, expert: Batch, agent: Batch, embed: Trunk
 ) -> tuple[SinkhornState, Any]:
     return settings.update(state, expert, agent, embed, key=KEY)
 
@@ -198,21 +198,21 @@ def test_the_critic_makes_the_cost_large_and_steps_only_when_it_is_due() -> None
         moved.append(not np.array_equal(before.weights[0], state.space.critic.weights[0]))
     assert moved == [i % 3 == 0 for i in range(60)]
     assert costs[:3] == [costs[0]] * 3 and costs[-1] > 1.3 * costs[0]
-    f, g = (state.space.critic(TRUNKS[0](w.obs[:, 0], np), np) for w in reversed(pair()))
+    f, g = (state.space.critic(TRUNKS[0](w.next_obs[:, 0], np), np) for w in reversed(pair()))
     assert naive_costs(f, g).sum() > 1.3 * costs[0]
 
 
 def test_the_first_reported_cost_is_the_naive_one() -> None:
     sil = narrow(SIL())
     state = sil.init(DEMOS, TRUNKS[0], key=KEY)
-    f, g = (state.space.critic(TRUNKS[0](w.obs[:, 0], np), np) for w in reversed(pair()))
+    f, g = (state.space.critic(TRUNKS[0](w.next_obs[:, 0], np), np) for w in reversed(pair()))
     _, metrics = update(sil, state, *pair(), TRUNKS[0])
     assert float(metrics["transport_cost"]) == pytest.approx(naive_costs(f, g).sum(), rel=1e-4)
 
 
 def test_slow_features_are_refreshed_when_it_is_their_turn() -> None:
     potil = POTIL(refresh=2)
-    nothing = Window(*(array[:0] for array in windows(EPISODE)))
+    nothing = Batch(*(array[:0] for array in batches(EPISODE)))
     state = potil.init(DEMOS, TRUNKS[0], key=KEY)
     for updates, slow in enumerate([0, 0, 2, 2]):
         if updates:

@@ -16,8 +16,8 @@ from pcil.nets.networks import MLP, unit_sphere
 from pcil.nets.optimiser import adam_init
 from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.tcn import TCN
-from pcil.types import Window
-from small import narrow, random_batch, windows
+from pcil.types import Batch
+from small import batches, narrow, random_batch, staying
 
 SETTINGS = narrow(TCN(temperature=0.5))
 ROLLOUT = narrow(TCN(temperature=0.5, negatives="rollout", margin=3, window=2))
@@ -31,21 +31,26 @@ def itself(obs: jnp.ndarray) -> jnp.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def update(settings: TCN, state: EmbeddingState, expert: Window, agent: Window, key: Any) -> tuple[EmbeddingState, Any]:
+def update(settings: TCN, state: EmbeddingState, expert: Batch, agent: Batch, key: Any) -> tuple[EmbeddingState, Any]:
     return settings.update(state, expert, agent, itself, key=key)
 
 
-def drawn(seed: int, n: int, rows: int = 32) -> Window:
+def drawn(seed: int, n: int, rows: int = 32) -> Batch:
     """Windows of `n` steps on random states."""
-    return windows(random_batch(rows + n, 6, 1, seed), n)
+    return batches(random_batch(rows + n, 6, 1, seed), n)
+
+
+def states(windows: Batch) -> np.ndarray:
+    """All states of each window, one more than it has steps."""
+    return np.concatenate([windows.obs[:, :1], windows.next_obs], axis=1)
 
 
 def phi(obs: Any) -> np.ndarray:
     return np.asarray(unit_sphere(ENCODER(jnp.asarray(obs))), np.float64)
 
 
-def metrics_of(settings: TCN, expert: Window, agent: Window, key: Any = KEY) -> dict[str, Any]:
-    state = EmbeddingState(ENCODER, adam_init(ENCODER), jnp.zeros((1, 6)), None)
+def metrics_of(settings: TCN, expert: Batch, agent: Batch, key: Any = KEY) -> dict[str, Any]:
+    state = EmbeddingState(ENCODER, adam_init(ENCODER), staying(jnp.zeros((1, 6)), jnp.zeros((1, 1))), None)
     return update(settings, state, expert, agent, key)[1]
 
 
@@ -61,7 +66,7 @@ def naive(anchor: np.ndarray, positive: np.ndarray, negatives: list[np.ndarray],
 def test_each_state_finds_the_next_one_among_those_of_all_other_rows() -> None:
     """Naive loops over a mix of 32 expert and 32 agent rows; all are anchors, whoever they are from."""
     expert, agent = drawn(1, 1), drawn(2, 1)
-    obs = np.concatenate([expert.obs, agent.obs])
+    obs = np.concatenate([states(expert), states(agent)])
     anchor, positive = phi(obs[:, 0]), phi(obs[:, 1])
     negatives = [np.delete(positive, i, axis=0) for i in range(64)]
     got = metrics_of(SETTINGS, expert, agent)
@@ -99,7 +104,7 @@ def test_negatives_of_the_same_rollout_are_those_from_the_margin_to_twice_the_ma
     """Naive loops; with `window = 1` the positive is the next state, and rows of other windows play no part."""
     settings = narrow(TCN(temperature=0.5, negatives="rollout", margin=3))
     expert, agent = drawn(1, 6), drawn(2, 6)
-    obs = np.concatenate([expert.obs, agent.obs])
+    obs = np.concatenate([states(expert), states(agent)])
     negatives = [phi(row[3:7]) for row in obs]
     got = metrics_of(settings, expert, agent)
     assert settings.span == 6
@@ -113,13 +118,14 @@ def test_what_lies_behind_a_termination_is_no_negative(end: int) -> None:
     The last state itself does count.
     """
     expert, agent = drawn(1, 6), drawn(2, 6)
-    expert.discount[:, end - 1 :] = 0
+    expert = expert._replace(discount=expert.discount.at[:, end - 1 :].set(0))
     losses = []
     for changed in (None, slice(end + 1, None), slice(end, None)):
-        obs = expert.obs.copy()
+        obs = states(expert).copy()
         if changed:
             obs[:, changed] += 1
-        losses.append(float(metrics_of(ROLLOUT, expert._replace(obs=obs), agent)["contrast_loss"]))
+        moved = Batch.of(obs, expert.action, expert.discount, expert.episode_id)
+        losses.append(float(metrics_of(ROLLOUT, moved, agent)["contrast_loss"]))
     assert losses[0] == losses[1] != losses[2]
 
 
@@ -128,10 +134,10 @@ def test_positives_are_at_most_so_many_steps_away_and_all_of_them_occur() -> Non
     angle = np.arange(4, dtype=np.float32) / 2
     obs = np.tile(np.stack([np.cos(angle), np.sin(angle)], axis=1), (500, 1, 1))
     ones = np.ones((500, 3), np.float32)
-    window = Window(obs, ones[..., None], ones, ones, np.zeros(500, np.int32))
+    window = Batch.of(obs, ones[..., None], ones, np.zeros(500, np.int32))
 
     def mean_cosine(settings: TCN) -> float:
-        state = EmbeddingState(IDENTITY, adam_init(IDENTITY), jnp.zeros((1, 2)), None)
+        state = EmbeddingState(IDENTITY, adam_init(IDENTITY), staying(jnp.zeros((1, 2)), jnp.zeros((1, 1))), None)
         return float(update(settings, state, window, window, KEY)[1]["positive_similarity"])
 
     assert mean_cosine(narrow(TCN(window=3))) == pytest.approx(np.mean(np.cos([0.5, 1.0, 1.5])), abs=0.05)
@@ -150,7 +156,7 @@ def test_nothing_says_which_rows_are_the_experts(settings: TCN) -> None:
 def test_windows_that_are_longer_than_needed_are_cut() -> None:
     """The agent's windows have at least `n_step` steps, the expert's `span`."""
     expert, agent = drawn(1, 1), drawn(2, 3)
-    short = Window(agent.obs[:, :2], agent.action[:, :1], agent.reward[:, :1], agent.discount[:, :1], agent.number)
+    short = Batch(*(array[:, :1] for array in agent[:4]), agent.episode_id)
     one, two = (metrics_of(SETTINGS, expert, other) for other in (agent, short))
     assert {name: float(value) for name, value in one.items()} == {name: float(value) for name, value in two.items()}
 
@@ -161,8 +167,8 @@ def test_neighbours_in_time_come_closer_than_strangers(settings: TCN) -> None:
     settings = narrow(settings, learning_rate=1e-2)
     rng = np.random.default_rng(0)
     steps = rng.normal(size=(2, 60, 6))
-    walks = [random_batch(60, 6, 1)._replace(obs=each.cumsum(axis=0).astype(np.float32)) for each in steps]
-    expert, agent = (windows(walk, settings.span) for walk in walks)
+    walks = [staying(each.cumsum(axis=0).astype(np.float32), np.zeros((60, 1), np.float32)) for each in steps]
+    expert, agent = (batches(walk, settings.span) for walk in walks)
     state = settings.init(walks, itself, key=KEY)
     for i in range(100):
         state, metrics = update(settings, state, expert, agent, jax.random.key(i))

@@ -57,7 +57,7 @@ def test_a_process_has_the_words_and_the_threads_of_its_run_and_its_input_stops_
     with executors.Local(plan(f"cores = 3\n{HARMLESS}"), 1) as local:
         handle = local.submit(job)
         words, variables = printed(job, "}\n").split("] ")
-        assert words == repr([str(job.folder), "3", *job.words])[:-1]
+        assert words == repr([str(job.folder), "3", *job.argv])[:-1]
         given = {"OMP_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
         assert variables == f"{given | {'XLA_FLAGS': None, 'CUDA_VISIBLE_DEVICES': None}}\n"
         assert local.poll(handle) is None

@@ -439,9 +439,9 @@ def train_embedding(p: Array, q: Array, x: Array, *, steps: int) -> tuple[Array,
         return q @ (phi @ anchor) - p @ (phi @ anchor)
 
     def step(carry: Any, _: None) -> tuple[Any, Array]:
-        net, moments = carry
+        net, opt_state = carry
         value, gradient = jax.value_and_grad(loss)(net)
-        return adam_step(net, gradient, moments, 3e-3), value
+        return adam_step(net, gradient, opt_state, 3e-3), value
 
     net = MLP.init((x.shape[1], 64, 64, 8), key=jax.random.key(0))
     (net, _), losses = jax.lax.scan(step, (net, adam_init(net)), None, length=steps)

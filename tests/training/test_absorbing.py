@@ -25,7 +25,8 @@ from pcil.envs.toy import Reach
 from pcil.errors import InputError
 from pcil.policy import Policy
 from pcil.rewards import Reward
-from pcil.training import loop, presets, runs
+from pcil.training import loop, presets, runs, state
+from pcil.training.callbacks import Callback
 from pcil.training.config import changed
 from pcil.training.replay import Replay
 from pcil.types import Episode
@@ -79,7 +80,7 @@ def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> loop.
     changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
     run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=Constant(pay=pay))
     folder.mkdir()
-    return loop.train_loop(run, folder, (), runs.Silent())
+    return loop.train_loop(run, folder, ())
 
 
 def value(state: loop.State, action: float, absorbing: bool) -> float:
@@ -136,13 +137,13 @@ def demos_of(task: str, folder: Path, ends: int = 0) -> str:
     return str(dataclasses.replace(source, task=task, episodes=tuple(episodes)).save(folder / f"ends-{ends}-v0"))
 
 
-class Told(runs.Silent):
+class Told(Callback):
     """Keeps what is said, and stops after the first episode."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
 
-    def say(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self.said.append(text)
 
     def stop(self) -> bool:
@@ -168,11 +169,11 @@ def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_
         run = dataclasses.replace(run, agent=narrow(BC()), frames=1200)
     told = Told()
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "run", told)
+        runs.execute(run, tmp_path / "run", [told])
     assert told.said[0] == f"Absorbing state: {'on' if absorbing else 'off'}; {why}."
     assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["agent"]["absorbing"] is absorbing
     with pytest.raises(loop.Stopped):  # the same command goes on
-        runs.execute(run, tmp_path / "run", told)
+        runs.execute(run, tmp_path / "run", [told])
     assert any("Resuming" in text for text in told.said)
 
 
@@ -190,8 +191,8 @@ def test_an_early_end_has_as_many_absorbing_steps_as_it_had_steps_before(
     """Else the end of a short demonstration would weigh less than any other state that all demonstrations reach."""
     episode = Episode(np.zeros((steps + 1, 1), np.float32), np.zeros((steps, 1), np.float32), np.zeros(steps), terminated)
     run = changed(small_run("expert"), {"agent.absorbing": True, "agent.n_step": n_step})
-    assert len(loop.absorbed(run, episode)) == rows
-    assert loop.absorbed(changed(run, {"agent.absorbing": False}), episode) is episode
+    assert len(state.absorbed(run, episode)) == rows
+    assert state.absorbed(changed(run, {"agent.absorbing": False}), episode) is episode
 
 
 @pytest.mark.slow
@@ -200,6 +201,6 @@ def test_by_default_imitation_reaches_a_goal_that_ends_the_episode(tmp_path: Pat
     task, expert = "toy/reach-v0", lambda obs: Reach.optimal_action(obs).astype(np.float32)
     data = demos.record(expert, envs.make(task), 10, task=task, seed=0, info={}).save(tmp_path / "reach-v0")
     run = presets.make(task, frames=8000, demos=str(data), evaluate_every=8000, evaluate_episodes=50)
-    runs.execute(run, tmp_path / "run", runs.Silent())
+    runs.execute(run, tmp_path / "run")
     last = [row for row in csv.DictReader((tmp_path / "run" / "eval.csv").open()) if int(row["frames"]) >= 8000]
     assert np.mean([int(row["length"]) < Reach.NUM_STEPS for row in last]) > 0.9

@@ -24,10 +24,10 @@ from pcil.training import checkpoint
 
 
 class Learned(eqx.Module):
-    """A stand-in for a learner: networks, moments, key data, a counter on the device, and settings that are no arrays."""
+    """A stand-in for a learner: networks, opt_state, key data, a counter on the device, and settings that are no arrays."""
 
     network: MLP
-    moments: dict[str, Any]
+    opt_state: dict[str, Any]
     root: jax.Array
     count: jax.Array
     rate: float
@@ -36,9 +36,9 @@ class Learned(eqx.Module):
 
 def make_learned(seed: int) -> Learned:
     network = MLP.init((3, 4, 2), key=jax.random.key(seed))
-    moments = {"mean": (jnp.arange(3.0) + seed, None), "a/b c": jnp.array([True, False])}
+    opt_state = {"mean": (jnp.arange(3.0) + seed, None), "a/b c": jnp.array([True, False])}
     root = jax.random.key_data(jax.random.key(seed))
-    return Learned(network, moments, root, jnp.int32(17 + seed), 0.5 * seed, f"name {seed}")
+    return Learned(network, opt_state, root, jnp.int32(17 + seed), 0.5 * seed, f"name {seed}")
 
 
 def make_arrays(seed: int) -> dict[str, np.ndarray]:

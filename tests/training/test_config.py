@@ -138,7 +138,7 @@ def test_a_setting_that_an_older_run_lacks_had_its_classes_default() -> None:
     """So a run of an older version goes on, and only a value that changes what it did is a difference."""
     run = presets.make("walker_walk")
     older = to_json(run)
-    del older["agent"]["noise_correlation"], older["agent"]["standardise"], older["agent"]["noise"]["end"]
+    del older["agent"]["noise_correlation"], older["agent"]["normalize_observations"], older["agent"]["noise"]["end"]
     found = differences(completed(older, to_json(run.plain)), to_json(run))
     assert run.agent.standardise and not DrQV2().standardise
     assert found == ["agent.standardise was False, now True"]

@@ -121,7 +121,7 @@ def test_fewer_environments_than_episodes_take_them_in_turns() -> None:
     assert (result.returns.tolist(), result.lengths.tolist()) == (returns, lengths)
     assert [len(env.seeds) for env in turns] == [4, 3]
     for episodes, single, copies in ((1000, False, LOCKSTEP), (2, False, 2), (2, True, 1)):
-        with environments_for("toy/point_mass-v0", episodes, single=single) as made:
+        with environments_for("toy/point_mass-v0", episodes, single=single) as (_, made):
             assert len(made) == copies
 
 

@@ -23,6 +23,7 @@ from pcil import cli, demos, envs
 from pcil.agents import DrQV2
 from pcil.errors import InputError, RunError, check_kinds
 from pcil.training import checkpoint, learner, loop, presets, runs
+from pcil.training.callbacks import Callback
 from pcil.training.config import Run
 from pcil.types import Spec
 from small import random_batch, small_run, windows
@@ -79,7 +80,7 @@ def test_a_failure_in_mid_episode_keeps_the_episodes_before_and_the_same_command
     register(**wrong)
     folder = tmp_path / "run"
     with pytest.raises(RunError, match=rf"'{ID}' .*{said}.*, in step 3 of training episode 4 \(seed \d+\)") as error:
-        runs.execute(odd_run(), folder, runs.Silent())
+        runs.execute(odd_run(), folder)
     assert not (folder / "DONE").exists() and "learner.root" in arrays(folder)
     assert all(np.isfinite(array).all() for array in arrays(folder).values())
     assert (folder / "error.txt").exists() == (error.value.__cause__ is not None)
@@ -89,7 +90,7 @@ def test_a_failure_in_mid_episode_keeps_the_episodes_before_and_the_same_command
         assert f"its traceback is in {folder / 'error.txt'}" in str(error.value)
     Flaky.broken = False
     listener = StopAfter(-1)
-    runs.execute(odd_run(), folder, listener)
+    runs.execute(odd_run(), folder, [listener])
     assert "Resuming at 30 of 60 frames." in listener.said and not (folder / "error.txt").exists()
     finish(odd_run(), tmp_path / "whole")
     same_run(tmp_path / "whole", folder)
@@ -99,14 +100,14 @@ def test_a_failure_in_an_evaluation_loses_nothing_either(tmp_path: Path) -> None
     """Of the two copies for evaluation the first plays its second episode at frame 30."""
     register(step=raising(OSError("the port is gone")), episode=2)
     with pytest.raises(RunError, match=r"OSError \(the port is gone\), in step 3 of training episode 2"):
-        runs.execute(odd_run(), tmp_path / "training", runs.Silent())
+        runs.execute(odd_run(), tmp_path / "training")
     gymnasium.registry.pop(ID)
     register(reset=raising(OSError("the port is gone")), episode=1)
     with pytest.raises(RunError, match=r"at the start of evaluation episode 1"):
-        runs.execute(odd_run(), tmp_path / "run", runs.Silent())
+        runs.execute(odd_run(), tmp_path / "run")
     assert [path.name for path in (tmp_path / "run" / "checkpoint").iterdir()] == ["0"]
     Flaky.broken = False
-    runs.execute(odd_run(), tmp_path / "run", runs.Silent())
+    runs.execute(odd_run(), tmp_path / "run")
     finish(odd_run(), tmp_path / "whole")
     same_run(tmp_path / "whole", tmp_path / "run")
 
@@ -184,10 +185,10 @@ def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(off
         Odd.open_copies[0].close()
         huge = [dataclasses.replace(episode, action=episode.action * np.float32(1e30)) for episode in recorded.episodes]
         with pytest.raises(RunError, match=f"training on {ID} diverged: agent/loss and agent/squared_error became .*update 1,"):
-            loop.train_loop(dataclasses.replace(run, seed_frames=0), tmp_path, huge, runs.Silent())
+            loop.train_loop(dataclasses.replace(run, seed_frames=0), tmp_path, huge)
     else:
         with pytest.raises(RunError, match=rf"training on {ID} diverged: agent/critic_loss became .* in update \d+,"):
-            runs.execute(run, tmp_path, runs.Silent())
+            runs.execute(run, tmp_path)
     no_value_is_missing(tmp_path)
 
 
@@ -207,7 +208,7 @@ def test_where_an_action_is_not_finite_the_parameters_that_went_first_are_named(
     run = odd_run(update_every=1)
     run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, tau=0.0123))  # compiled for this test alone
     with pytest.raises(RunError, match=r"the actor's parameters became .* in update 8, after frame 20;") as error:
-        runs.execute(run, tmp_path, runs.Silent())
+        runs.execute(run, tmp_path)
     assert "an action whose entry 0 is nan, in step 9 of training episode 3" in str(error.value.__context__)
     no_value_is_missing(tmp_path)
 
@@ -217,7 +218,7 @@ def test_a_learned_reward_that_is_not_finite_is_not_stored(monkeypatch: pytest.M
     label = learner.label_episode
     monkeypatch.setattr(learner, "label_episode", lambda *given: np.where(np.arange(10) == 6, np.inf, label(*given)))
     with pytest.raises(RunError, match=rf"The learned reward is inf in step 7 of training episode 1 of {ID}"):
-        runs.execute(odd_run(label="stored"), tmp_path / "run", runs.Silent())
+        runs.execute(odd_run(label="stored"), tmp_path / "run")
     no_value_is_missing(tmp_path / "run")
 
 
@@ -234,7 +235,7 @@ def test_a_checkpoint_of_before_there_was_a_record_of_what_is_finite_goes_on(
 
     with monkeypatch.context() as patch, pytest.raises(loop.Stopped):
         patch.setattr(checkpoint, "flatten", without)
-        runs.execute(odd_run(), tmp_path / "old", StopAfter(4))
+        runs.execute(odd_run(), tmp_path / "old", [StopAfter(4)])
     assert "learner.totals['finite']" not in arrays(tmp_path / "old")
     finish(odd_run(), tmp_path / "old")
     same_run(tmp_path / "whole", tmp_path / "old")
@@ -249,11 +250,11 @@ def test_a_single_environment_changes_no_result(monkeypatch: pytest.MonkeyPatch,
     finish(odd_run(evaluate_episodes=5), tmp_path / "many")
     monkeypatch.setattr(Odd, "once", True)
     with pytest.raises(InputError, match=r"can't be made \(AssertionError: this environment can be open once only\)"):
-        runs.execute(odd_run(evaluate_episodes=5), tmp_path / "refused", runs.Silent())
+        runs.execute(odd_run(evaluate_episodes=5), tmp_path / "refused")
     single = odd_run(evaluate_episodes=5, single_environment=True)
     finish(single, tmp_path / "single", stops=(3,))
     same_run(tmp_path / "many", tmp_path / "single")
-    runs.execute(odd_run(evaluate_episodes=5), tmp_path / "single", runs.Silent())  # a setting of the machine
+    runs.execute(odd_run(evaluate_episodes=5), tmp_path / "single")  # a setting of the machine
 
 
 def test_evaluation_in_a_single_environment_gives_the_same_numbers(
@@ -291,7 +292,7 @@ def test_a_function_or_an_environment_is_trained_in_and_named_in_run_json(tmp_pa
     assert names == ["function test_failures.make_env", "object odd.Odd"]
     assert pcil.train(make_env, out=tmp_path / "function", **SMALL).final_return == result.final_return
     with pytest.raises(InputError, match="was given in Python"):
-        runs.execute(presets.make(names[0], **SMALL), tmp_path / "function", runs.Silent())
+        runs.execute(presets.make(names[0], **SMALL), tmp_path / "function")
 
 
 def test_a_function_that_returns_the_same_environment_twice_is_refused(tmp_path: Path) -> None:
@@ -364,12 +365,12 @@ def test_settings_of_another_kind_are_shown_shortened(field: str, value: Any, sa
     assert len(str(error.value)) < 150
 
 
-class CtrlC(runs.Silent):
+class CtrlC(Callback):
     """Presses it at the end of the second episode."""
 
     episodes = 0
 
-    def episode(self, run: Run, frames: int, total_reward: float) -> None:
+    def episode(self, row: dict[str, Any]) -> None:
         self.episodes += 1
         if self.episodes == 2:
             os.kill(os.getpid(), signal.SIGINT)
@@ -378,7 +379,7 @@ class CtrlC(runs.Silent):
 def test_ctrl_c_in_python_saves_the_run_and_raises(tmp_path: Path) -> None:
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        pcil.train(make_env, out=tmp_path / "run", reporter=CtrlC(), **SMALL)
+        pcil.train(make_env, out=tmp_path / "run", callbacks=[CtrlC()], **SMALL)
     assert signal.getsignal(signal.SIGINT) is before
     assert [path.name for path in (tmp_path / "run" / "checkpoint").iterdir()] == ["20"]
     pcil.train(make_env, out=tmp_path / "run", **SMALL)
@@ -390,14 +391,14 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     class Twice(CtrlC):
         """Presses it again at once."""
 
-        def episode(self, run: Run, frames: int, total_reward: float) -> None:
-            super().episode(run, frames, total_reward)
-            super().episode(run, frames, total_reward)
+        def episode(self, row: dict[str, Any]) -> None:
+            super().episode(row)
+            super().episode(row)
             os.kill(os.getpid(), signal.SIGINT)
             raise AssertionError("the second one was not heard")
 
     with pytest.raises(KeyboardInterrupt):
-        pcil.train(make_env, out=tmp_path / "run", reporter=Twice(), **SMALL)
+        pcil.train(make_env, out=tmp_path / "run", callbacks=[Twice()], **SMALL)
     assert not (tmp_path / "run" / "checkpoint").exists()
 
 

@@ -24,8 +24,9 @@ from pcil.demos import Demonstrations
 from pcil.errors import InputError, json_object
 from pcil.policy import load_policy
 from pcil.rewards import REWARDS
-from pcil.training import checkpoint, loop, presets, runs
+from pcil.training import checkpoint, presets, runs
 from pcil.training.config import Run
+from pcil.training.state import start
 from pcil.types import Episode, Origin
 from small import POINT_MASS, save_point_mass_demos, small_run
 
@@ -303,7 +304,7 @@ def test_pcil_on_states_alone_is_bit_for_bit_pcil_on_whole_demonstrations(tmp_pa
     """Actions and rewards of the demonstrations are nowhere in it."""
     states, whole = stripped(tmp_path / "data", "actions", "rewards"), tmp_path / "data" / "whole" / "point_mass-v0"
     for name, folder in (("states", states), ("whole", str(whole))):
-        result = runs.execute(small_run(demos=folder), tmp_path / name, runs.Silent())
+        result = runs.execute(small_run(demos=folder), tmp_path / name)
         assert (result.demos_return is None) == (name == "states")
     one, other = (load_policy(tmp_path / name) for name in ("states", "whole"))
     obs = np.random.default_rng(0).normal(size=(64, 2)).astype(np.float32)
@@ -382,25 +383,25 @@ def test_a_run_and_its_policy_carry_their_arguments(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(gymnasium, "make", lambda name, **kwargs: made.append(kwargs) or make(name, **kwargs))
     run = small_run(task="test/slider-v0", demos=save(tmp_path, skip=5), env_kwargs={"skip": 5})
     made.clear()
-    runs.execute(run, tmp_path / "run", runs.Silent())
+    runs.execute(run, tmp_path / "run")
     assert len(made) >= 4 and all(kwargs.get("skip") == 5 for kwargs in made)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["env_kwargs"] == {"skip": 5}
     assert load_policy(tmp_path / "run").env_kwargs == {"skip": 5}
     with pytest.raises(InputError, match=r"env_kwargs.skip was 5, now 3"):
         other = dataclasses.replace(run, env_kwargs={"skip": 3}, demos_mismatch="keep")
-        runs.execute(other, tmp_path / "run", runs.Silent())
+        runs.execute(other, tmp_path / "run")
 
 
 def test_an_older_run_had_no_arguments_whatever_is_given_now(tmp_path: Path) -> None:
     folder, run = tmp_path / "run", small_run(demos=save_point_mass_demos(tmp_path))
-    runs.execute(run, folder, runs.Silent())
+    runs.execute(run, folder)
     about = json.loads((folder / "run.json").read_text())
     for name in ("env_kwargs", "clip_actions", "demos_mismatch"):
         del about["run"][name]
     (folder / "run.json").write_text(json.dumps(about))
-    runs.execute(run, folder, runs.Silent())
+    runs.execute(run, folder)
     with pytest.raises(InputError, match="clip_actions was False, now True"):
-        runs.execute(dataclasses.replace(run, clip_actions=True), folder, runs.Silent())
+        runs.execute(dataclasses.replace(run, clip_actions=True), folder)
 
 
 @pytest.mark.parametrize("value", [[1], "x", "[1]", {1: 2}, {"a": {1, 2}}, {"a": float("nan")}, "[" * 100_000])
@@ -442,5 +443,5 @@ def test_the_loop_gives_rewards_of_states_no_action_of_absent_ones(tmp_path: Pat
     run = small_run(demos=stripped(tmp_path, "actions"))
     found = runs.demonstrations(run)
     assert found is not None
-    state = loop.start(run, envs.spec(envs.make(POINT_MASS)), found.episodes)
+    state = start(run, envs.spec(envs.make(POINT_MASS)), found.episodes)
     assert state.expert is not None and not state.expert.sample(np.random.default_rng(0), 8, 1).action.any()

@@ -14,7 +14,7 @@ import pytest
 
 import make_golden
 from pcil.training import learner, presets
-from pcil.training.config import Method, Run
+from pcil.training.config import Algorithm, Run
 from pcil.types import Batch, Spec, Window
 from small import random_batch, windows
 
@@ -56,7 +56,7 @@ def test_defaults_stay_what_old_run_folders_mean_by_them() -> None:
 SPEC = Spec(24, 6, 2)
 """As walker_walk's."""
 PRESETS = {(method, preset): presets.make("walker_walk", method, preset) for method, preset in presets.METHOD_SETTINGS}
-DIFFERENT: dict[Method, str] = {run.learner: " ".join(names) for names, run in PRESETS.items()}
+DIFFERENT: dict[Algorithm, str] = {run.learner: " ".join(names) for names, run in PRESETS.items()}
 """Runs that differ in what is compiled; three presets of the expert's reward with two agents are two, for example."""
 
 
@@ -78,12 +78,12 @@ def updated(run: Run, by: Any = None) -> Any:
     return by(one) if by else one()
 
 
-def run_of(method: Method) -> Run:
+def run_of(method: Algorithm) -> Run:
     return next(run for run in PRESETS.values() if run.learner == method)
 
 
 @pytest.mark.parametrize("method", DIFFERENT, ids=DIFFERENT.get)
-def test_every_preset_of_every_method_can_be_traced(method: Method) -> None:
+def test_every_preset_of_every_method_can_be_traced(method: Algorithm) -> None:
     """Shapes and types alone, so nothing is compiled."""
     totals = updated(run_of(method), jax.eval_shape)
     assert {"updates"} < set(totals) and all(
@@ -93,6 +93,6 @@ def test_every_preset_of_every_method_can_be_traced(method: Method) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", DIFFERENT, ids=DIFFERENT.get)
-def test_every_preset_of_every_method_goes_through_an_update(method: Method) -> None:
+def test_every_preset_of_every_method_goes_through_an_update(method: Algorithm) -> None:
     totals = updated(run_of(method))
     assert float(totals["updates"]) == 1 and all(np.isfinite(total).all() for total in totals.values())

@@ -22,9 +22,10 @@ from pcil.agents import Agent
 from pcil.nets.networks import Actor, Trunk
 from pcil.rewards import Reward
 from pcil.seeds import Stream
-from pcil.training import learner, loop, runs
-from pcil.training.config import Method, Run
+from pcil.training import collect, learner, loop
+from pcil.training.config import Algorithm, Run
 from pcil.training.learner import Learner
+from pcil.training.state import State, start
 from pcil.types import Episode, Spec, Window
 from small import POINT_MASS, random_batch, small_run, windows
 
@@ -118,7 +119,7 @@ WINDOW, EXPERT, SEEN = rows(1, 6), rows(2, 3), rows(3, 3)
 
 def after(label: Literal["sampled", "stored"], updates: int = 1, seen: Window | None = None) -> Learner:
     """The learner after some updates on the same windows; update `i` is at agent step `10 i`."""
-    method = Method(Scribe(), Recorder(), label)
+    method = Algorithm(Scribe(), Recorder(), label)
     state = learner.init(method, SPEC, [random_batch(5, OBS, ACTION)], 0)
     for i in range(updates):
         state, actor = learner.update(method, state, WINDOW, EXPERT, seen, np.int32(10 * i), np.int32(i))
@@ -160,7 +161,7 @@ def test_reward_label_and_agent_draw_from_three_keys_of_the_update_and_no_two_up
         got = [float(x) for x in (state.reward["draw"], state.agent["reward"].ravel()[2], state.agent["draw"])]
         assert got == expected
         drawn += got
-    first = learner.init(Method(Scribe(), Recorder(), "sampled"), SPEC, [random_batch(5, OBS, ACTION)], 0)
+    first = learner.init(Algorithm(Scribe(), Recorder(), "sampled"), SPEC, [random_batch(5, OBS, ACTION)], 0)
     drawn += [float(first.agent["draw"]), float(first.reward["draw"])]
     assert len(set(drawn)) == len(drawn)
 
@@ -184,20 +185,20 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     updates: list[dict[str, Any]] = []
     real = learner.update
 
-    def update(method: Method, state: Learner, window: Any, expert: Any, seen: Any, step: Any, count: Any) -> Any:
-        updates.append({"window": window, "expert": expert, "seen": seen, "step": int(step), "count": int(count)})
-        return real(method, state, window, expert, seen, step, count)
+    def update(method: Algorithm, state: Learner, window: Any, expert: Any, longer: Any, step: Any, count: Any) -> Any:
+        updates.append({"window": window, "expert": expert, "longer": longer, "step": int(step), "count": int(count)})
+        return real(method, state, window, expert, longer, step, count)
 
     monkeypatch.setattr(learner, "update", update)
     return updates
 
 
-def play(run: Run, episodes: int = 2, action_repeat: int = 1) -> loop.State:
+def play(run: Run, episodes: int = 2, action_repeat: int = 1) -> State:
     """Whole episodes of 50 steps on the point mass, the way that the loop plays and keeps them."""
     env, spec = envs.make(POINT_MASS), SPEC._replace(action_repeat=action_repeat)
-    state = loop.start(run, spec, DEMOS)
+    state = start(run, spec, DEMOS)
     for _ in range(episodes):
-        episode = loop.play(run, env, spec, state)
+        (episode,) = collect.play(run, [env], spec, state)
         state.replay.add(episode, episode.reward)
     return state
 
@@ -234,12 +235,12 @@ def test_windows_and_expert_rows_are_drawn_from_the_episodes_own_stream(drawn: l
     assert drawn == [], "no window before the first episode is kept"
     state = play(run, episodes=2)
     drawn.clear()
-    loop.play(run, envs.make(POINT_MASS), SPEC, state)
+    collect.play(run, [envs.make(POINT_MASS)], SPEC, state)
     rng, expert = seeds.rng(1, Stream.SAMPLE, 2), state.expert
     assert expert is not None and len(drawn) == 16
     for update in drawn:
         assert same(update["window"], state.replay.sample(rng, 6, 1)) and same(update["expert"], expert.sample(rng, 3, 1))
-        assert update["seen"] is None
+        assert update["longer"] is None
 
 
 @pytest.mark.parametrize("repeat", [1, 2])
@@ -271,7 +272,7 @@ def test_acting_is_by_the_actor_that_the_last_update_left(drawn: list[dict[str, 
 def test_the_replay_keeps_the_tasks_rewards_or_the_labels_of_when_the_episode_ended(label: str, tmp_path: Path) -> None:
     """A stored label is by the networks at the end of its episode, which have seen all of its updates."""
     run = recorded(label=label, frames=150, evaluate_every=150)
-    held = loop.train_loop(run, tmp_path, DEMOS, runs.Silent()).replay.state()
+    held = loop.train_loop(run, tmp_path, DEMOS).replay.state()
     paid, obs = held["reward"].reshape(3, 51), held["obs"].reshape(3, 51, OBS)
     if label == "sampled":
         assert np.allclose(paid[:, :-1], 1 - np.linalg.norm(obs[:, 1:], axis=-1), atol=1e-5)

@@ -21,9 +21,10 @@ import pytest
 from pcil import envs
 from pcil.errors import InputError
 from pcil.policy import load_policy
-from pcil.training import checkpoint, learner, loop, presets, runs
+from pcil.training import checkpoint, collect, learner, loop, presets, runs
+from pcil.training.callbacks import Callback
 from pcil.training.config import Run
-from pcil.training.metrics import WALL_CLOCK
+from pcil.training.state import WALL_CLOCK, start
 from pcil.types import Spec
 from small import POINT_MASS, random_batch, save_point_mass_demos, small_run, windows
 
@@ -33,7 +34,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
     return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
 
 
-class StopAfter(runs.Silent):
+class StopAfter(Callback):
     """Asks to stop after so many episodes; remembers what it was told."""
 
     def __init__(self, episodes: int) -> None:
@@ -43,7 +44,7 @@ class StopAfter(runs.Silent):
         self.left -= 1
         return self.left == 0
 
-    def say(self, text: str) -> None:
+    def message(self, text: str) -> None:
         self.said.append(text)
 
 
@@ -68,8 +69,8 @@ def finish(run: Run, folder: Path, stops: tuple[int, ...] = ()) -> None:
     """Run to the end, stopping after so many episodes in each session before the last."""
     for episodes in stops:
         with pytest.raises(loop.Stopped):
-            runs.execute(run, folder, StopAfter(episodes))
-    runs.execute(run, folder, runs.Silent())
+            runs.execute(run, folder, [StopAfter(episodes)])
+    runs.execute(run, folder)
 
 
 CASES = [
@@ -108,20 +109,20 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
 
-    class Crash(runs.Silent):
+    class Crash(Callback):
         """Dies at the end of its second episode."""
 
         episodes = 0
 
-        def episode(self, run: Run, frames: int, total_reward: float) -> None:
+        def episode(self, row: dict[str, Any]) -> None:
             self.episodes += 1
             if self.episodes == 2:
                 raise RuntimeError("the power went")
 
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "crashed", StopAfter(2))
+        runs.execute(run, tmp_path / "crashed", [StopAfter(2)])
     with pytest.raises(RuntimeError, match="power"):
-        runs.execute(run, tmp_path / "crashed", Crash())
+        runs.execute(run, tmp_path / "crashed", [Crash()])
     assert len(rows(tmp_path / "crashed")[1]) == 4, "two episodes more than the checkpoint has"
     finish(run, tmp_path / "crashed")
     same_run(tmp_path / "whole", tmp_path / "crashed")
@@ -131,11 +132,11 @@ def test_a_damaged_checkpoint_is_passed_over_and_said(demos: str, tmp_path: Path
     run = small_run(demos=demos, checkpoint_seconds=0.0)
     finish(run, tmp_path / "whole")
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "torn", StopAfter(4))
+        runs.execute(run, tmp_path / "torn", [StopAfter(4)])
     newest = max((tmp_path / "torn" / "checkpoint").iterdir(), key=lambda path: int(path.name))
     (newest / "meta.json").write_bytes((newest / "meta.json").read_bytes()[:-20])
     listener = StopAfter(-1)
-    runs.execute(run, tmp_path / "torn", listener)
+    runs.execute(run, tmp_path / "torn", [listener])
     assert any("damaged" in text for text in listener.said) and any("Resuming at 150" in text for text in listener.said)
     same_run(tmp_path / "whole", tmp_path / "torn")
 
@@ -181,7 +182,7 @@ def test_a_finished_run_says_so_and_trains_no_more(demos: str, tmp_path: Path) -
     run = small_run(demos=demos)
     finish(run, tmp_path / "run")
     before = {path: path.read_bytes() for path in (tmp_path / "run").glob("*.*")}
-    result = runs.execute(run, tmp_path / "run", runs.Silent())
+    result = runs.execute(run, tmp_path / "run")
     assert {path: path.read_bytes() for path in (tmp_path / "run").glob("*.*")} == before
     assert result.final_return == np.mean([float(row[2]) for row in rows(tmp_path / "run")[0][-2:]])
 
@@ -243,7 +244,7 @@ def test_a_finished_run_that_lost_a_part_is_whole_again(damage: Any, said: str, 
     finish(run, tmp_path / "run")
     damage(tmp_path / "run")
     listener = StopAfter(-1)
-    runs.execute(run, tmp_path / "run", listener)
+    runs.execute(run, tmp_path / "run", [listener])
     assert said in " ".join(listener.said)
     finish(run, tmp_path / "whole")
     same_run(tmp_path / "whole", tmp_path / "run")
@@ -256,10 +257,10 @@ def test_a_finished_run_that_lost_a_part_is_whole_again(damage: Any, said: str, 
 def test_a_done_that_comes_before_the_end_is_noticed(demos: str, tmp_path: Path) -> None:
     run = small_run(demos=demos)
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "run", StopAfter(5))
+        runs.execute(run, tmp_path / "run", [StopAfter(5)])
     (tmp_path / "run" / "DONE").write_text('{"final_return": 1.0}')
     listener = StopAfter(-1)
-    runs.execute(run, tmp_path / "run", listener)
+    runs.execute(run, tmp_path / "run", [listener])
     assert "DONE is there, but the last whole checkpoint is at 250 frames; the run goes on." in " ".join(listener.said)
     finish(run, tmp_path / "whole")
     same_run(tmp_path / "whole", tmp_path / "run")
@@ -272,7 +273,7 @@ def test_a_finished_run_without_checkpoint_and_policy_is_refused(demos: str, tmp
     finish(run, folder)  # a policy without checkpoints is all that one needs
     shutil.rmtree(folder / "policy")
     with pytest.raises(InputError, match=r"holds no policy .*, and no checkpoint has it; delete .*DONE to train it again"):
-        runs.execute(run, folder, runs.Silent())
+        runs.execute(run, folder)
 
 
 def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: str, tmp_path: Path) -> None:
@@ -281,7 +282,7 @@ def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: 
     finish(run, tmp_path / "whole")
     for name, size in (("old", 10**6), ("short", 30)):
         with pytest.raises(loop.Stopped):
-            runs.execute(run, tmp_path / name, StopAfter(4))
+            runs.execute(run, tmp_path / name, [StopAfter(4)])
         arrays, meta, _ = checkpoint.restore(tmp_path / name / "checkpoint")
         assert arrays is not None
         meta["positions"] = {file: len(text) for file, text in meta.pop("logs").items()}
@@ -289,7 +290,7 @@ def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: 
         log = tmp_path / name / "eval.csv"
         log.write_bytes(log.read_bytes()[:size])
         listener = StopAfter(-1)
-        runs.execute(run, tmp_path / name, listener)
+        runs.execute(run, tmp_path / name, [listener])
         lost = [text for text in listener.said if "has lost" in text]
         assert bool(lost) == (name == "short")
     same_run(tmp_path / "whole", tmp_path / "old")
@@ -309,32 +310,32 @@ def test_a_changed_setting_is_refused_with_the_difference(
 ) -> None:
     run = small_run(demos=demos)
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "run", StopAfter(1))
+        runs.execute(run, tmp_path / "run", [StopAfter(1)])
     if change == {"agent": "gamma"}:
         change = {"agent": dataclasses.replace(run.agent, gamma=0.9)}
     with pytest.raises(InputError, match=said):
-        runs.execute(dataclasses.replace(run, **change), tmp_path / "run", runs.Silent())
+        runs.execute(dataclasses.replace(run, **change), tmp_path / "run")
 
 
 def test_a_run_of_before_a_setting_was_there_goes_on(demos: str, tmp_path: Path) -> None:
     run, folder = small_run(demos=demos), tmp_path / "run"
     with pytest.raises(loop.Stopped):
-        runs.execute(run, folder, StopAfter(1))
+        runs.execute(run, folder, [StopAfter(1)])
     about = json.loads((folder / "run.json").read_text())
     assert about["run"]["agent"].pop("noise_correlation") == 0.0
     (folder / "run.json").write_text(json.dumps(about))
     other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, noise_correlation=0.5))
     with pytest.raises(InputError, match=r"another run: agent.noise_correlation was 0.0, now 0.5; "):
-        runs.execute(other, folder, runs.Silent())
-    runs.execute(run, folder, runs.Silent())
+        runs.execute(other, folder)
+    runs.execute(run, folder)
     assert (folder / "DONE").exists()
 
 
 def test_how_often_to_save_may_change(demos: str, tmp_path: Path) -> None:
     run = small_run(demos=demos)
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "run", StopAfter(1))
-    runs.execute(dataclasses.replace(run, checkpoint_seconds=1.0), tmp_path / "run", runs.Silent())
+        runs.execute(run, tmp_path / "run", [StopAfter(1)])
+    runs.execute(dataclasses.replace(run, checkpoint_seconds=1.0), tmp_path / "run")
     assert (tmp_path / "run" / "DONE").exists()
 
 
@@ -342,40 +343,40 @@ def test_other_demonstrations_under_the_same_name_are_refused(tmp_path: Path) ->
     path = save_point_mass_demos(tmp_path, episodes=2)
     run = small_run(demos=path)
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "run", StopAfter(1))
+        runs.execute(run, tmp_path / "run", [StopAfter(1)])
     Path(path).rename(tmp_path / "old")
     save_point_mass_demos(tmp_path, episodes=3)
     with pytest.raises(InputError, match=r"demos.hash was"):
-        runs.execute(run, tmp_path / "run", runs.Silent())
+        runs.execute(run, tmp_path / "run")
 
 
 def test_folders_that_cannot_be_used_are_refused(demos: str, tmp_path: Path) -> None:
     run = small_run(demos=demos)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="can't be written"):
-        runs.execute(run, tmp_path / "file", runs.Silent())
+        runs.execute(run, tmp_path / "file")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match=r"holds something else \(thesis.tex\)"):
-        runs.execute(run, tmp_path / "full", runs.Silent())
+        runs.execute(run, tmp_path / "full")
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "run.json").write_text("[]")
     with pytest.raises(InputError, match="can't be read"):
-        runs.execute(run, tmp_path / "odd", runs.Silent())
+        runs.execute(run, tmp_path / "odd")
     assert [path.read_text() for path in (tmp_path / "full").iterdir()] == ["mine"]
 
 
 def test_two_processes_never_share_a_folder(demos: str, tmp_path: Path) -> None:
-    class Intruder(runs.Silent):
+    class Intruder(Callback):
         """Starts the same run inside the run."""
 
         def stop(self) -> bool:
             with pytest.raises(InputError, match="Another process is training"):
-                runs.execute(small_run(demos=demos), tmp_path / "run", runs.Silent())
+                runs.execute(small_run(demos=demos), tmp_path / "run")
             return True
 
     with pytest.raises(loop.Stopped):
-        runs.execute(small_run(demos=demos), tmp_path / "run", Intruder())
+        runs.execute(small_run(demos=demos), tmp_path / "run", [Intruder()])
 
 
 def test_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(
@@ -393,7 +394,7 @@ def test_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(
 
     monkeypatch.setattr(checkpoint, "save", save_until_full)
     with pytest.raises(InputError, match="disk is full"):
-        runs.execute(run, tmp_path / "full", runs.Silent())
+        runs.execute(run, tmp_path / "full")
     monkeypatch.undo()
     finish(run, tmp_path / "full")
     same_run(tmp_path / "whole", tmp_path / "full")
@@ -480,21 +481,21 @@ def reused() -> Iterator[str]:
 
 def test_an_episode_holds_each_observation_although_the_environment_reuses_its_buffer(reused: str) -> None:
     run, env = small_run("expert", reused), envs.make(reused)
-    episode = loop.play(run, env, envs.spec(env), loop.start(run, envs.spec(env), ()))
+    (episode,) = collect.play(run, [env], envs.spec(env), start(run, envs.spec(env), ()))
     assert episode.obs.tolist() == [[0], [1], [2], [3], [4]]
 
 
 def test_episodes_too_short_for_a_window_are_refused_when_updates_are_due(reused: str, tmp_path: Path) -> None:
     agent = dataclasses.replace(small_run("expert").agent, n_step=5)
     with pytest.raises(InputError, match=r"Every episode of pcil_test/reused-v0 so far is cut before the 5 steps"):
-        runs.execute(small_run("expert", reused, agent=agent), tmp_path / "run", runs.Silent())
+        runs.execute(small_run("expert", reused, agent=agent), tmp_path / "run")
     assert [line["frames"] for line in rows(tmp_path / "run")[1]][-1] == 96, "refused at the first episode after 100 frames"
 
 
 def test_demonstrations_too_short_for_a_window_are_refused(demos: str, tmp_path: Path) -> None:
     run = small_run("tcn", demos=demos, reward={"negatives": "rollout", "margin": 30})
     with pytest.raises(InputError, match="are all shorter than the 60 steps that an update draws"):
-        runs.execute(run, tmp_path / "run", runs.Silent())
+        runs.execute(run, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -503,7 +504,7 @@ def test_prefill_counts_the_steps_that_went_in_and_pays_them_alpha(rows: int, de
     """120 steps are three demonstrations of 50; a replay of 60 rows keeps the last of them."""
     run = small_run("pwil", demos=demos, replay_steps=rows, reward={"prefill_steps": 120, "alpha": 3.0, "task_weight": 0.5})
     spec, episodes = envs.spec(envs.make(run.task)), runs.demonstrations(run).episodes
-    held = loop.start(run, spec, episodes).replay.state()
+    held = start(run, spec, episodes).replay.state()
     assert held["segments"][:, 3].tolist() == ([2] if rows == 60 else [0, 1, 2])
     assert np.allclose(held["reward"][-51:-1], 3 + 0.5 * episodes[2].reward)
 
@@ -512,7 +513,7 @@ def test_pwil_pays_alpha_for_every_step_of_a_copy_of_the_only_demonstration(demo
     """Expert and agent are compared by the same states of their steps."""
     run = small_run("pwil", demos=demos, num_demos=1, reward={"alpha": 3.0})
     (copy,) = runs.demonstrations(run).episodes
-    state = loop.start(run, envs.spec(envs.make(run.task)), [copy])
+    state = start(run, envs.spec(envs.make(run.task)), [copy])
     assert np.allclose(learner.label_episode(run.learner, state.learner, copy, 0), 3)
 
 
@@ -520,10 +521,10 @@ def test_without_a_whole_checkpoint_the_run_begins_again_and_says_so(demos: str,
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
     with pytest.raises(loop.Stopped):
-        runs.execute(run, tmp_path / "lost", StopAfter(3))
+        runs.execute(run, tmp_path / "lost", [StopAfter(3)])
     shutil.rmtree(tmp_path / "lost" / "checkpoint")
     listener = StopAfter(-1)
-    runs.execute(run, tmp_path / "lost", listener)
+    runs.execute(run, tmp_path / "lost", [listener])
     assert any("no whole checkpoint" in text and "begins again" in text for text in listener.said)
     same_run(tmp_path / "whole", tmp_path / "lost")
 
@@ -532,17 +533,17 @@ def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> 
     """As that of another version would be."""
     run, folder = small_run(demos=demos), tmp_path / "run"
     with pytest.raises(loop.Stopped):
-        runs.execute(run, folder, StopAfter(1))
+        runs.execute(run, folder, [StopAfter(1)])
     other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24, absorbing=False))
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"run": other.to_json()}))
     before = (folder / "train.jsonl").read_bytes()
     with pytest.raises(InputError, match=r"of another version \(learner.agent.*24"):
-        runs.execute(other, folder, runs.Silent())
+        runs.execute(other, folder)
     assert (folder / "train.jsonl").read_bytes() == before
 
 
 def test_a_replay_smaller_than_an_episode_is_refused_before_anything_is_written(reused: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has 4 rows, and an episode of pcil_test/reused-v0 may take 5"):
-        runs.execute(small_run("expert", reused, replay_steps=4), tmp_path / "run", runs.Silent())
+        runs.execute(small_run("expert", reused, replay_steps=4), tmp_path / "run")
     assert not (tmp_path / "run").exists()

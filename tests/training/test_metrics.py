@@ -16,8 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcil.report.load import read_evaluations
+from pcil.training.callbacks import EVAL_COLUMNS, Callback, Callbacks, LogFiles, TensorBoard
 from pcil.training.evaluate import Evaluation
-from pcil.training.metrics import EVAL_COLUMNS, WALL_CLOCK, MetricWriter, pearson
+from pcil.training.metrics import pearson
+from pcil.training.state import WALL_CLOCK
+from small import small_run
 
 law = settings(deadline=None, derandomize=True, max_examples=20)
 NAMES = ("eval.csv", "train.jsonl")
@@ -27,13 +30,33 @@ def make_evaluation(*returns: float) -> Evaluation:
     return Evaluation(np.array(returns), np.arange(len(returns)) + 10, 0.5)
 
 
+class Told(Callback):
+    """Keeps what a person is told."""
+
+    def __init__(self, said: list[str]) -> None:
+        self.said = said
+
+    def message(self, text: str) -> None:
+        self.said.append(text)
+
+
+class Writer(Callbacks):
+    """The log files and TensorBoard, as a run has them."""
+
+    def __init__(self, folder: Path, logs: dict[str, str], said: list[str]) -> None:
+        self.files = LogFiles(folder, logs, Told(said))
+        super().__init__([self.files, TensorBoard()])
+        self.begin(small_run(), folder, self.files.history(0.0, None))
+        self.logs, self.rows = self.files.contents, self.files.rows
+
+
 @contextmanager
-def writer(folder: Path, logs: dict[str, str] | None = None, said: list[str] | None = None) -> Iterator[MetricWriter]:
-    log = MetricWriter(folder, logs or {}, 0.0, [].append if said is None else said.append)
+def writer(folder: Path, logs: dict[str, str] | None = None, said: list[str] | None = None) -> Iterator[Writer]:
+    log = Writer(folder, logs or {}, [] if said is None else said)
     try:
         yield log
     finally:
-        log.close()
+        log.end()
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -53,8 +76,8 @@ def test_an_evaluation_is_one_row_an_episode(tmp_path: Path) -> None:
 
 def test_an_episode_is_one_line_of_json(tmp_path: Path) -> None:
     with writer(tmp_path) as log:
-        log.episode(1000, {"return": 0.1 + 0.2, "length": 500, "reward/loss": 1e-30})
-        log.episode(2000, {"return": float("nan"), "length": 500})
+        log.episode({"frames": 1000, "return": 0.1 + 0.2, "length": 500, "reward/loss": 1e-30})
+        log.episode({"frames": 2000, "return": float("nan"), "length": 500})
     lines = [json.loads(line) for line in (tmp_path / "train.jsonl").read_text().splitlines()]
     assert lines[0] == {"frames": 1000, "return": 0.1 + 0.2, "length": 500, "reward/loss": 1e-30}
     assert lines[1]["frames"] == 2000 and np.isnan(lines[1]["return"])
@@ -64,7 +87,7 @@ def test_every_row_is_on_disk_when_the_call_returns(tmp_path: Path) -> None:
     with writer(tmp_path) as log:
         assert contents(tmp_path)["eval.csv"] == b"frames,episode,return,length,seconds\n"
         log.evaluation(2000, 1.0, make_evaluation(7.0))
-        log.episode(2000, {"return": 7.0})
+        log.episode({"frames": 2000, "return": 7.0})
         assert contents(tmp_path)["eval.csv"].endswith(b"2000,0,7.0,10,1.0\n")
         assert contents(tmp_path)["train.jsonl"] == b'{"frames": 2000, "return": 7.0}\n'
         assert log.logs() == {name: content.decode() for name, content in contents(tmp_path).items()}
@@ -73,7 +96,7 @@ def test_every_row_is_on_disk_when_the_call_returns(tmp_path: Path) -> None:
 def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
     with writer(tmp_path) as log:
         log.evaluation(2000, 1.0, make_evaluation(7.0, 8.0))
-        log.episode(2000, {"return": 7.0, "reward/loss": 0.5, "note": "text", "bad": float("inf")})
+        log.episode({"frames": 2000, "return": 7.0, "reward/loss": 0.5, "note": "text", "bad": float("inf")})
     (events,) = (tmp_path / "tensorboard").glob("events.out.tfevents.*")
     content = events.read_bytes()
     for tag in (b"evaluation/return", b"episode/return", b"reward/loss"):
@@ -114,7 +137,7 @@ def test_rewinding_removes_exactly_what_came_later(tmp_path: Path, kept: int) ->
         logs, rows, before = [log.logs()], [log.rows()], [contents(tmp_path)]
         for k in range(3):
             log.evaluation(1000 * k, 1.0 * k, make_evaluation(k / 3, -k / 7))
-            log.episode(1000 * k, {"return": k / 3})
+            log.episode({"frames": 1000 * k, "return": k / 3})
             logs.append(log.logs())
             rows.append(log.rows())
             before.append(contents(tmp_path))
@@ -124,7 +147,7 @@ def test_rewinding_removes_exactly_what_came_later(tmp_path: Path, kept: int) ->
         assert log.logs() == logs[kept]
         for k in range(kept, 3):
             log.evaluation(1000 * k, 1.0 * k, make_evaluation(k / 3, -k / 7))
-            log.episode(1000 * k, {"return": k / 3})
+            log.episode({"frames": 1000 * k, "return": k / 3})
         assert log.logs() == logs[3]
     assert contents(tmp_path) == before[3]
 
@@ -149,7 +172,7 @@ def test_a_damaged_log_is_written_again(tmp_path: Path, name: str, kind: str) ->
     """It is said, but for what follows a whole log: that was written after the checkpoint."""
     with writer(tmp_path) as log:
         log.evaluation(0, 0.0, make_evaluation(1.0))
-        log.episode(0, {"return": 1.0})
+        log.episode({"frames": 0, "return": 1.0})
         logs, whole = log.logs(), contents(tmp_path)
     damaged = DAMAGE[kind](whole[name])
     if damaged is None:
@@ -192,9 +215,9 @@ def test_tensorboard_is_written_again_from_the_logs(tmp_path: Path) -> None:
     """Whatever a kill left of it: points of before the checkpoint are there once, and none of after it."""
     with writer(tmp_path) as log:
         log.evaluation(1000, 5.0, make_evaluation(1.0, 2.0))
-        log.episode(1000, {"return": 0.5, "reward/loss": 0.25, "length": 3, "seconds": 5.5})
+        log.episode({"frames": 1000, "return": 0.5, "reward/loss": 0.25, "length": 3, "seconds": 5.5})
         logs = log.logs()
-        log.episode(2000, {"return": 0.75, "seconds": 9.0})
+        log.episode({"frames": 2000, "return": 0.75, "seconds": 9.0})
     expected = [
         ("evaluation/return", 1000, 1.5, 5.0),
         ("episode/return", 1000, 0.5, 5.5),
@@ -212,7 +235,7 @@ def test_a_run_that_starts_anew_starts_with_empty_files_and_one_header(tmp_path:
     for _ in range(2):
         with writer(tmp_path) as log:
             log.evaluation(0, 0.0, make_evaluation(1.0))
-            log.episode(0, {"return": 1.0})
+            log.episode({"frames": 0, "return": 1.0})
     assert len((tmp_path / "train.jsonl").read_text().splitlines()) == 1
     with (tmp_path / "eval.csv").open() as file:
         assert [tuple(row) for row in csv.reader(file)] == [EVAL_COLUMNS, ("0", "0", "1.0", "10", "0.0")]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import io
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from pcil.training.callbacks import History
 from pcil.training.evaluate import Evaluation
 from pcil.training.progress import Bar, compared
 from small import small_run
@@ -19,9 +21,10 @@ def shown(expert: float | None, **changes: Any) -> str:
     stream = io.StringIO()
     run = dataclasses.replace(small_run("expert", frames=100_000), **changes)
     with Bar(Console(file=stream, force_terminal=True, width=140, color_system=None), expert) as bar:
-        bar.evaluation(run, 0, Evaluation(np.array([1.0, 3.0]), np.array([5, 5]), 0.1))
-        bar.episode(run, 1000, 12.0)
-        bar.episode(run, 2000, 34.0)
+        bar.begin(run, Path(), History([], [], 0.0, None))
+        bar.evaluation(0, 0.1, Evaluation(np.array([1.0, 3.0]), np.array([5, 5]), 0.1))
+        bar.episode({"frames": 1000, "return": 12.0})
+        bar.episode({"frames": 2000, "return": 34.0})
         assert not bar.stop()
     return stream.getvalue()
 

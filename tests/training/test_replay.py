@@ -67,7 +67,7 @@ def check(window: Window, expected: dict, batch: int, n: int) -> list[float]:
     """Every row is one of the enumerated windows, exactly; returns which."""
     assert window.obs.shape == (batch, n + 1, 2) and window.action.shape == (batch, n, 1)
     assert window.reward.shape == window.discount.shape == (batch, n)
-    assert all(array.dtype == np.float32 for array in window[:4]) and window.number.dtype == np.int32
+    assert all(array.dtype == np.float32 for array in window[:4]) and window.episode_id.dtype == np.int32
     rows = zip(*(array.tolist() for array in window), strict=True)
     for obs, action, reward, discount, number in rows:
         assert number == obs[0][0] // 1000, "episodes are named in the order in which they are added"

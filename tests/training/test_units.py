@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pcil.envs.toy import PointMass
 from pcil.training import learner, presets
-from pcil.training.config import Method
+from pcil.training.config import Algorithm
 from pcil.training.presets import METHODS
 from pcil.types import Batch, Episode, Spec, Window
 from small import narrow
@@ -25,9 +25,9 @@ UPDATES = 3
 
 
 @cache
-def method_of(name: str) -> Method:
+def method_of(name: str) -> Algorithm:
     run = presets.make("walker_walk", name)
-    return Method(narrow(run.agent), narrow(run.reward), run.label)
+    return Algorithm(narrow(run.agent), narrow(run.reward), run.label)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Units:
         return (obs.astype(np.float64) * self.scale + self.offset).astype(np.float32)
 
 
-def draws(method: Method, units: Units) -> tuple[list[Batch], Any, Episode]:
+def draws(method: Algorithm, units: Units) -> tuple[list[Batch], Any, Episode]:
     """Demonstrations, a function that draws windows, and an episode; the expert never moves entry 3, nobody moves entry 4."""
     rng = np.random.default_rng(0)
 
@@ -59,7 +59,7 @@ def draws(method: Method, units: Units) -> tuple[list[Batch], Any, Episode]:
         obs = states(rows, n + 1, still=still)
         return Window(obs, actions(rows, n), reward, np.ones((rows, n), np.float32), np.arange(rows, dtype=np.int32))
 
-    demos = [Batch(states(30, still=True), actions(30)) for _ in range(2)]
+    demos = [Batch.of(states(31, still=True), actions(30)) for _ in range(2)]
     episode = Episode(states(21, still=False), actions(20), rng.normal(size=20))
     return demos, windows, episode
 
@@ -123,7 +123,7 @@ UNITS = {
 def test_cloning_learns_in_any_units_beside_a_huge_constant(name: str) -> None:
     """At an offset of 1e6 float32 tells apart what is 0.06 apart, and no more is lost than that."""
     run = presets.make("walker_walk", "bc")
-    method = Method(narrow(run.agent, hidden=32, learning_rate=3e-3), run.reward, run.label)
+    method = Algorithm(narrow(run.agent, hidden=32, learning_rate=3e-3), run.reward, run.label)
     rng = np.random.default_rng(0)
     state = learner.init(method, Spec(3, 2, 1), [], 0)
     actor = None

@@ -16,15 +16,15 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import InputError, check_ranges
 from pcil.nets.networks import Actor, Scaler, Trunk, scaled, unscaled
-from pcil.nets.optimiser import Moments, adam_init, adam_step
+from pcil.nets.optimiser import OptState, adam_init, adam_step
 from pcil.types import Spec, Window
 
 
 class BCState(eqx.Module):
-    """The actor, its optimiser's moments, and the scale of observations."""
+    """The actor, its optimiser's opt_state, and the scale of observations."""
 
     actor: Actor
-    moments: Moments
+    opt_state: OptState
     scaler: Scaler | None
 
 
@@ -44,7 +44,7 @@ class BC(Agent):
     """Width of the trunk."""
     hidden: int = 256
     """Width of the two hidden layers."""
-    standardise: bool = False
+    normalize_observations: bool = False
     """Scale observations to a running mean of 0 and standard deviation of 1 before the trunk: units make no difference then."""
 
     def __post_init__(self) -> None:
@@ -55,7 +55,7 @@ class BC(Agent):
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> BCState:
         actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=key)
-        return BCState(actor, adam_init(actor), Scaler.init(spec.obs_dim) if self.standardise else None)
+        return BCState(actor, adam_init(actor), Scaler.init(spec.obs_dim) if self.normalize_observations else None)
 
     def loss(
         self, actor: Actor, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"]
@@ -74,8 +74,8 @@ class BC(Agent):
         gradient_of = jax.value_and_grad(self.loss, has_aux=True)
         obs = scaled(state.scaler, window.obs[:, 0])
         (loss, metrics), gradient = gradient_of(state.actor, obs, window.action[:, 0])
-        actor, moments = adam_step(state.actor, gradient, state.moments, self.learning_rate)
-        return BCState(actor, moments, state.scaler), {"loss": loss, **metrics}
+        actor, opt_state = adam_step(state.actor, gradient, state.opt_state, self.learning_rate)
+        return BCState(actor, opt_state, state.scaler), {"loss": loss, **metrics}
 
     def actor(self, state: BCState) -> Actor:
         return Actor(self.trunk(state, "actor"), state.actor.head)

@@ -20,20 +20,20 @@ from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
 from pcil.nets.losses import n_step_target
 from pcil.nets.networks import Actor, Critic, Scaler, Trunk, scaled, unscaled
-from pcil.nets.noise import LinearSchedule, normal_steps, perturb
-from pcil.nets.optimiser import Moments, adam_init, adam_step
+from pcil.nets.noise import LinearSchedule, add_noise, normal_steps
+from pcil.nets.optimiser import OptState, adam_init, adam_step
 from pcil.types import Spec, Window
 
 
 class DrQV2State(eqx.Module):
-    """Networks, the critic's slow copy (trunk included), the optimiser's moments, and the scale of observations."""
+    """Networks, the critic's slow copy (trunk included), the optimiser's opt_state, and the scale of observations."""
 
     actor: Actor
     """Of scaled observations, as the critic; `DrQV2.actor` gives the one of plain observations."""
     critic: Critic
     critic_target: Critic
-    actor_moments: Moments
-    critic_moments: Moments
+    actor_opt_state: OptState
+    critic_opt_state: OptState
     scaler: Scaler | None
 
 
@@ -58,7 +58,7 @@ class DrQV2(Agent):
     noise_correlation: float = 0.0
     """Correlation of the acting noise of a step with that of the step before; 0 is white noise, as DrQ-v2's. Correlated
     noise moves a joint for several steps in one direction."""
-    standardise: bool = False
+    normalize_observations: bool = False
     """Scale observations to a running mean of 0 and standard deviation of 1 before the trunks: units make no difference."""
 
     def __post_init__(self) -> None:
@@ -71,7 +71,7 @@ class DrQV2(Agent):
         actor = Actor.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=actor_key)
         critic = Critic.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=critic_key)
         target = jax.tree.map(jnp.copy, critic)
-        scaler = Scaler.init(spec.obs_dim) if self.standardise else None
+        scaler = Scaler.init(spec.obs_dim) if self.normalize_observations else None
         return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic), scaler)
 
     def critic_loss(
@@ -95,13 +95,13 @@ class DrQV2(Agent):
         alive: Float[Array, " batch"],
     ) -> Float[Array, ""]:
         """Minus the smaller value of the actor's noisy action (deterministic policy gradient), where `alive` is 1."""
-        first, second = critic(obs, perturb(actor(obs), noise))
+        first, second = critic(obs, add_noise(actor(obs), noise))
         return -jnp.mean(alive * jnp.minimum(first, second))
 
     def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
         """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`; `a' = 0` in the absorbing one."""
         obs_n = window.obs[:, -1]
-        action = perturb(state.actor(scaled(state.scaler, obs_n)), noise) * self._alive(obs_n)[:, None]
+        action = add_noise(state.actor(scaled(state.scaler, obs_n)), noise) * self._alive(obs_n)[:, None]
         first, second = state.critic_target(scaled(state.scaler, obs_n), action)
         return n_step_target(window.reward, window.discount, jnp.minimum(first, second), self.gamma)
 
@@ -120,14 +120,14 @@ class DrQV2(Agent):
 
         obs, action = scaled(state.scaler, window.obs[:, 0]), window.action[:, 0]
         gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
-        critic, critic_moments = adam_step(state.critic, gradient, state.critic_moments, self.learning_rate)
+        critic, critic_opt_state = adam_step(state.critic, gradient, state.critic_opt_state, self.learning_rate)
 
         loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1], alive)
-        actor, actor_moments = adam_step(state.actor, gradient, state.actor_moments, self.learning_rate)
+        actor, actor_opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
 
         critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
         metrics |= {"actor_loss": loss}
-        return DrQV2State(actor, critic, critic_target, actor_moments, critic_moments, state.scaler), metrics
+        return DrQV2State(actor, critic, critic_target, actor_opt_state, critic_opt_state, state.scaler), metrics
 
     def actor(self, state: DrQV2State) -> Actor:
         trunk = self.trunk(state, "actor")
@@ -138,4 +138,4 @@ class DrQV2(Agent):
 
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
         noise = normal_steps(rng, action_dim, self.noise_correlation)
-        return lambda actor, obs, step: perturb(actor(obs, np), self.noise(step, np) * next(noise), np)
+        return lambda actor, obs, step: add_noise(actor(obs, np), self.noise(step, np) * next(noise), np)

@@ -107,7 +107,7 @@ class Setup:
         self.window = self.replay.sample(rng, run.agent.batch_size, run.agent.n_step)
         rows = run.reward.batch_size
         self.expert = self.replay.sample(rng, rows, run.reward.span) if rows else None
-        demo = Batch(normal(500, spec.obs_dim), normal(500, spec.action_dim))
+        demo = Batch.of(normal(501, spec.obs_dim), normal(500, spec.action_dim))
         self.state = learner.init(run.learner, spec, (demo,) * 10, 0)
         self.actor = on_host(run.agent.actor(self.state.agent))
         self.explore = run.agent.explorer(spec.action_dim, rng)
@@ -223,6 +223,7 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
     import jax
 
     from pcil.training import loop, runs
+    from pcil.training.callbacks import Callback
 
     names = [name for _, name in parts]
     inside, calls = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
@@ -238,11 +239,11 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
 
         return call
 
-    class Watch(runs.Silent):
+    class Watch(Callback):
         """Notes the end of each episode, and stops when there are enough."""
 
-        def episode(self, run: Any, frames: int, total_reward: float) -> None:
-            ends.append((time.perf_counter(), frames, dict(inside), dict(calls)))
+        def episode(self, row: dict[str, Any]) -> None:
+            ends.append((time.perf_counter(), row["frames"], dict(inside), dict(calls)))
 
         def stop(self) -> bool:
             return len(ends) >= 6 and ends[-1][0] - ends[3][0] > seconds
@@ -254,7 +255,7 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
             setattr(owner, name, timed(name, original))
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         with contextlib.suppress(loop.Stopped):
-            runs.execute(run, Path(folder) / "run", Watch())
+            runs.execute(run, Path(folder) / "run", [Watch()])
     (start, first, inside_before, before), (end, last, inside_after, after) = ends[3], ends[-1]
     within = {name: inside_after[name] - inside_before[name] for name in names}
     return Timing(end - start, last - first, within, {name: after[name] - before[name] for name in names})

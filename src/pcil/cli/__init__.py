@@ -20,7 +20,7 @@ COMMANDS = {
     "bench": "Measure the speed of each part, and its ratio to the floor.",
     "doctor": "Say what is installed, what is wrong, and what to do.",
 }
-"""Each is a file of this folder, with a `main` that is given its words."""
+"""Each is a file of this folder, with a `main` that is given its argv."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -29,13 +29,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that can't show every letter
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        code = _command(words)
+        code = _command(argv)
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:
-        again = "; the same command goes on from the last checkpoint" if words[0] in ("train", "sweep") else ""
+        again = "; the same command goes on from the last checkpoint" if argv[0] in ("train", "sweep") else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
         return 130
     except BrokenPipeError:
@@ -49,16 +49,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return said[1]
 
 
-def _command(words: list[str]) -> int:
-    if not words or words[0] in ("-h", "--help"):
+def _command(argv: list[str]) -> int:
+    if not argv or argv[0] in ("-h", "--help"):
         print(_overview())
         return 0
-    if words[0] == "--version":
+    if argv[0] == "--version":
         print(f"pcil {importlib.import_module('pcil').__version__}")
         return 0
-    if words[0] not in COMMANDS:
-        raise InputError(f"There is no command {words[0]!r}; the commands are {', '.join(COMMANDS)}.")
-    return importlib.import_module(f"pcil.cli.{words[0]}").main(words[1:])
+    if argv[0] not in COMMANDS:
+        raise InputError(f"There is no command {argv[0]!r}; the commands are {', '.join(COMMANDS)}.")
+    return importlib.import_module(f"pcil.cli.{argv[0]}").main(argv[1:])
 
 
 def _overview() -> str:

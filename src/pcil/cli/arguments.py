@@ -1,23 +1,25 @@
-"""From the words of a command to a function's arguments, by `tyro`; what does not fit is one sentence, not a framed box."""
+"""From the arguments of a command to those of a function, by `tyro`; what does not fit is one sentence, not a framed box."""
 
 import contextlib
 import dataclasses
 import functools
-import importlib
 import io
 import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pcil.errors import InputError, brief
+from pcil.modules import Trust
 
 if TYPE_CHECKING:
+    from pcil.training.callbacks import Callback
     from pcil.training.config import Run
 
 
-def call(name: str, function: Callable[..., int], words: list[str]) -> int:
-    """Call `function` with the arguments that `words` give, or show its help and return 0.
+def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
+    """Call `function` with the arguments that `argv` gives, or show its help and return 0.
 
     `InputError` says what does not fit. `tyro` prints that in a box on standard error and exits; only its parsing is listened
     to, so what `function` itself writes there goes there at once.
@@ -28,12 +30,12 @@ def call(name: str, function: Callable[..., int], words: list[str]) -> int:
     def bind(*positional: Any, **named: Any) -> Callable[[], int]:
         return functools.partial(function, *positional, **named)
 
-    if {"-h", "--help"} & set(words):
-        words = ["--help"]  # tyro's help leaves out the positional arguments that it has read before
+    if {"-h", "--help"} & set(argv):
+        argv = ["--help"]  # tyro's help leaves out the positional arguments that it has read before
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            bound = tyro.cli(bind, prog=f"pcil {name}", args=words)
+            bound = tyro.cli(bind, prog=f"pcil {name}", args=argv)
     except SystemExit as end:
         if not end.code:
             return 0
@@ -41,65 +43,109 @@ def call(name: str, function: Callable[..., int], words: list[str]) -> int:
     return bound()
 
 
-def train(words: list[str], execute: Callable[["Run", Path], int], trust: Sequence[str] | None = None) -> int:
-    """Call `execute` with the run and the folder that the words of `pcil train` give.
-
-    Where a file gives the words, `trust` are the modules that it may name; where a person typed them, it is None.
-    """
+def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"], int]) -> int:
+    """Call `execute` with the run, the folder and the callbacks that the arguments of `pcil train` give."""
     import tyro
 
     from pcil import envs, modules
     from pcil.training import presets
-    from pcil.training.config import Run
+    from pcil.training.config import REGISTRIES, Run
 
-    given = peek(words)
+    argv = [_renamed(word) for word in argv]
+    given = peek(argv)
+    if "settings" in given:
+        return call("train", functools.partial(_train_again, execute), argv)
     task = envs.task_name(given.get("task", "walker_walk"))
     changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
-    if "reward" in given:
-        modules.admit("--reward", [given["reward"].partition(":")[0]], trust)
-        changes["reward"] = _load_reward(given["reward"])
-        words = without(words, "reward")
+    for part in REGISTRIES.keys() & given.keys():
+        modules.admit(f"--{part}", modules.of_class(given[part]), None)
+        changes[part] = given[part]
+        argv = without(argv, part)
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
     if "reward" in given and "method" not in given:
         default = dataclasses.replace(default, method=given["reward"])  # its results go by its own name
-    if "task" not in given and not {"-h", "--help"} & set(words):
+    if "task" not in given and not {"-h", "--help"} & set(argv):
         raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
 
-    def train(out: Path, run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default) -> int:
+    def train(
+        out: Path,
+        run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default,
+        callbacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:CLASS ...")] = (),
+    ) -> int:
         """Train a policy, or resume where a run stopped.
 
-        The settings shown are those of the chosen method and preset. --reward my.module:MyReward takes a reward of your own
-        in place of the method's.
+        The settings shown are those of the chosen method and preset. --reward and --agent take one by its name, or
+        my.module:MyReward, one of your own; --settings FILE takes all settings from the run.json of another run.
 
         Args:
             out: The run's folder; one that holds the same run resumes it.
+            callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
         """
-        modules.admit("The task", modules.of_task(task), trust)
-        modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), trust)
-        return execute(dataclasses.replace(run, task=task), out)
+        modules.admit("The task", modules.of_task(task), None)
+        modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), None)
+        return execute(dataclasses.replace(run, task=task), out, _callbacks(callbacks))
 
-    return call("train", train, words)
+    return call("train", train, argv)
 
 
-def _load_reward(spec: str) -> Any:
-    """An instance of the reward class that `module:Class` names."""
-    from pcil.rewards import Reward
+def _train_again(
+    execute: Callable[["Run", Path, "Sequence[Callback]"], int],
+    settings: str,
+    out: Path,
+    callbacks: tuple[str, ...] = (),
+    trust: Trust = (),
+) -> int:
+    """Train a policy with the settings of another run, or resume where a run stopped.
 
-    module, _, name = spec.partition(":")
+    Args:
+        settings: The run.json of a run, or what it holds, as one word of JSON.
+        out: The run's folder; one that holds the same run resumes it.
+        callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
+        trust: Modules that the settings may name, whose code is then run, such as my.module.
+    """
+    from pcil import files, modules
+    from pcil.training.config import REGISTRIES, Run, part_of_run
+
+    source = "--settings" if settings.lstrip().startswith("{") else settings
     try:
-        kind = getattr(importlib.import_module(module), name)
-        if not (isinstance(kind, type) and issubclass(kind, Reward)):
-            raise TypeError(f"{name} is no subclass of pcil.Reward")
-        return kind()
-    except Exception as error:  # the module is a person's own and may raise anything
-        raise InputError(
-            f"--reward {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like my.module:MyReward."
-        ) from error
+        table = files.parse_json(settings.encode()) if source == "--settings" else files.read_json(Path(settings))
+        flat = files.flat(table.get("run", table))
+        classes = {}
+        for part in REGISTRIES:
+            if named := modules.of_class(flat[f"{part}.class"]):
+                modules.admit(source, named, trust)
+                classes[flat[f"{part}.class"]] = part_of_run(part, flat[f"{part}.class"])
+        run = Run.from_json(flat, classes)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise InputError(f"{source} holds no settings of a run ({error}); give the run.json of one.") from error
+    modules.admit(source, modules.of_task(run.task, run.env_kwargs), trust)
+    return execute(run, out, _callbacks(callbacks))
 
 
-def peek(words: list[str]) -> dict[str, str]:
+def _callbacks(specs: Sequence[str]) -> "list[Callback]":
+    """An object of each class that was named."""
+    from pcil import modules
+    from pcil.training.callbacks import Callback
+
+    modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec)], None)
+    return [modules.load("--callbacks", spec, Callback, "my.module:MyLogger")() for spec in specs]
+
+
+def _renamed(word: str) -> str:
+    """A word of the command line with a setting by the name that it has today, which is said of an older one."""
+    from pcil.training.config import RENAMED
+
+    option, equals, value = word.partition("=")
+    name = option.removeprefix("--").replace("-", "_")
+    if not option.startswith("--") or name not in RENAMED:
+        return word
+    print(f"pcil: {option} is now called --{RENAMED[name].replace('_', '-')}.", file=sys.stderr)
+    return f"--{RENAMED[name].replace('_', '-')}{equals}{value}"
+
+
+def peek(argv: list[str]) -> dict[str, str]:
     """The values of the options as they are given, before the method has decided which options there are."""
-    given, rest = {}, iter(words)
+    given, rest = {}, iter(argv)
     for word in rest:
         if word.startswith("--") and "=" in word:
             name, value = word[2:].split("=", 1)
@@ -111,9 +157,9 @@ def peek(words: list[str]) -> dict[str, str]:
     return given
 
 
-def without(words: list[str], name: str) -> list[str]:
-    """`words` without `--name VALUE` and `--name=VALUE`."""
-    left, rest = [], iter(words)
+def without(argv: list[str], name: str) -> list[str]:
+    """`argv` without `--name VALUE` and `--name=VALUE`."""
+    left, rest = [], iter(argv)
     for word in rest:
         if word == f"--{name}":
             next(rest, None)

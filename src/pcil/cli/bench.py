@@ -32,5 +32,5 @@ def bench(
     return 0
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("bench", bench, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("bench", bench, argv)

@@ -21,5 +21,5 @@ def demos(json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> i
     return 0
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("demos", demos, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("demos", demos, argv)

@@ -132,5 +132,5 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("doctor", doctor, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("doctor", doctor, argv)

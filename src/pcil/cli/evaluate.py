@@ -42,7 +42,7 @@ def evaluate(
     arguments.within(0, 2**31 - 1, seed=seed)
     policy, env_kwargs = playable(folder, env_kwargs, trust)
     copies = environments_for(policy.task, episodes, env_kwargs, single=single_environment)
-    with contextlib.redirect_stdout(sys.stderr), copies as made:  # an environment may print
+    with contextlib.redirect_stdout(sys.stderr), copies as (_, made):  # an environment may print
         policy.check_fits(made[0])
         result = roll_out(policy, made, seed=seed, episodes=episodes)
     row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
@@ -55,5 +55,5 @@ def evaluate(
     return 0
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("evaluate", evaluate, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("evaluate", evaluate, argv)

@@ -52,5 +52,5 @@ def record(
     return 0
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("record", record, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("record", record, argv)

@@ -52,5 +52,5 @@ def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     return with_defaults(settings)
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("report", report, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("report", report, argv)

@@ -14,7 +14,7 @@ _OF_TASKS = {"--methods", "--seeds", "--preset", "--frames"}
 """Options of tasks; a file says of itself what they would."""
 
 
-def main(words: list[str]) -> int:
+def main(argv: list[str]) -> int:
     def sweep(
         what: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FILE|TASK...", help_behavior_hint="")],
         /,
@@ -54,10 +54,10 @@ def main(words: list[str]) -> int:
             table: dict[str, Any] = {"tasks": list(what), "methods": list(methods), "seeds": list(seeds), "preset": preset}
             table |= {} if frames is None else {"frames": frames}
             plan = plans.of_table("The command", table, out, None)
-        elif other := [*what[1:], *sorted({word.partition("=")[0] for word in words} & _OF_TASKS)]:
+        elif other := [*what[1:], *sorted({word.partition("=")[0] for word in argv} & _OF_TASKS)]:
             raise InputError(f"{other[0]} is given beside {what[0]}; a file says itself what its runs are.")
         else:
             plan = plans.read(Path(what[0]), out, trust)
         return sweep.sweep(plan, out, jobs, address, progress.Screen(file=sys.stdout))
 
-    return arguments.call("sweep", sweep, words)
+    return arguments.call("sweep", sweep, argv)

@@ -38,5 +38,5 @@ def theory(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, 
     return 0
 
 
-def main(words: list[str]) -> int:
-    return arguments.call("theory", theory, words)
+def main(argv: list[str]) -> int:
+    return arguments.call("theory", theory, argv)

@@ -1,36 +1,36 @@
 """`pcil train`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pcil.cli import arguments
 
 if TYPE_CHECKING:
+    from pcil.training.callbacks import Callback
     from pcil.training.config import Run
 
 
-def main(words: list[str]) -> int:
-    return arguments.train(words, _run)
+def main(argv: list[str]) -> int:
+    return arguments.train(argv, _run)
 
 
-def _run(run: "Run", out: Path) -> int:
+def _run(run: "Run", out: Path, callbacks: "Sequence[Callback]") -> int:
     """Execute with a progress bar; end with a plain statement of how close to the expert it came, and the curve."""
-    from pcil import envs
     from pcil.training import loop, progress, runs
 
-    demos = runs.demonstrations(run)
-    expert = demos.return_mean if demos else _shipped_return(envs.task_name(run.task))
-    with progress.Bar(progress.Screen(), expert) as bar:
+    with progress.Bar(progress.Screen(), _shipped_return(run)) as bar:
         try:
-            result = runs.execute(run, out, bar)
+            result = runs.execute(run, out, [bar, *callbacks])
         except loop.Stopped:
-            bar.say(f"Stopped; the run in {out} is saved, and the same command goes on from here.")
+            bar.message(f"Stopped; the run in {out} is saved, and the same command goes on from here.")
             return 128 + int(bar.signal or 0)
         if not bar.evaluations:
-            bar.say(f"The run in {out} is done.")
+            bar.message(f"The run in {out} is done.")
+        expert = bar.expert_return if result.demos_return is None else result.demos_return
         share = f", {progress.compared(result.final_return, expert)}" if expert is not None else ""
-        bar.say(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
-        bar.say(f"Policy: {result.folder / 'policy'}")
+        bar.message(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
+        bar.message(f"Policy: {result.folder / 'policy'}")
         _draw_curve(result.folder, expert, bar)
     return 0
 
@@ -41,13 +41,17 @@ def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
     try:
         from pcil.report import figures
     except ImportError:
-        bar.say("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
+        bar.message("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
     else:
         with files.room_for(f"Drawing {out / 'curve.png'}"):
-            bar.say(f"Learning curve: {figures.run_curve(out, expert)}")
+            bar.message(f"Learning curve: {figures.run_curve(out, expert)}")
 
 
-def _shipped_return(task: str) -> float | None:
+def _shipped_return(run: "Run") -> float | None:
+    """The mean return of the demonstrations that ship for the task of a run that needs none."""
+    from pcil import envs
     from pcil.demos import shipped
 
-    return {row["task"]: row["return_mean"] for row in shipped()}.get(task)
+    if run.needs_demos:
+        return None
+    return {row["task"]: row["return_mean"] for row in shipped()}.get(envs.task_name(run.task))

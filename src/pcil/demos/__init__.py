@@ -19,6 +19,7 @@ from jaxtyping import Float
 from pcil import envs, files, seeds
 from pcil.demos.arrays import episodes_of
 from pcil.demos.minari import Stored, read, reason, task_of, write
+from pcil.envs.rollout import Rollout
 from pcil.errors import InputError, brief
 from pcil.types import Episode, Origin, Spec
 
@@ -211,8 +212,12 @@ def record(
         raise InputError(f"The minimum return is {minimum_return}; it must be a number that an episode can reach.")
     env, kept = envs.checked(env), []
     for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
-        env.episode = f"recorded episode {attempt + 1}"
-        episode = _rollout(policy, env, seeds.episode_seed(seed, seeds.Stream.RECORD, attempt))
+        rollout = Rollout([env], [seeds.episode_seed(seed, seeds.Stream.RECORD, attempt)], [f"recorded episode {attempt + 1}"])
+        while rollout.playing:
+            with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
+                action = env.checked_action(policy(rollout.obs[0])).astype(np.float32)
+            rollout.step([action])
+        (episode,) = rollout.episodes()
         if minimum_return is None or episode.total_reward >= minimum_return:
             kept.append(_in_unit_box(episode, env.action_space))
         if len(kept) == episodes:
@@ -222,19 +227,6 @@ def record(
         f"Only {len(kept)} of {limit} episodes of {task} returned at least {minimum_return}, but {episodes} were "
         f"asked for: lower the minimum return or record a better policy."
     )
-
-
-def _rollout(policy: Callable[[np.ndarray], Any], env: envs.Checked, seed: int) -> Episode:
-    observations, actions, rewards = [env.reset(seed=seed)[0]], [], []
-    terminated = truncated = False
-    while not (terminated or truncated):
-        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
-            action = env.checked_action(policy(observations[-1])).astype(np.float32)
-        obs, reward, terminated, truncated, _ = env.step(action)
-        observations.append(obs)
-        actions.append(action)
-        rewards.append(reward)
-    return Episode(np.stack(observations), np.stack(actions), np.array(rewards), terminated, seed)
 
 
 def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:

@@ -47,7 +47,7 @@ def normal_steps(rng: np.random.Generator, dim: int, correlation: float) -> Iter
         steps = np.float32(correlation) * steps + fresh * rng.standard_normal(dim, dtype=np.float32)
 
 
-def perturb(
+def add_noise(
     mean: Float[Any, "*batch action"], noise: Float[Any, "*batch action"], xp: ModuleType = jnp
 ) -> Float[Any, "*batch action"]:
     """`mean + noise`, clamped into the action range; the clamp passes the gradient of `mean` through unchanged."""

@@ -9,23 +9,23 @@ import optax
 from jaxtyping import Array, Int
 
 Network = TypeVar("Network")
-Moments = Any
+OptState = Any
 """Adam's running means, a pytree."""
 
 
-def adam_init(network: Any) -> Moments:
-    """The moments before the first step."""
+def adam_init(network: Any) -> OptState:
+    """The opt_state before the first step."""
     return optax.adam(0.0).init(network)
 
 
-def adam_step(network: Network, gradient: Any, moments: Moments, learning_rate: float) -> tuple[Network, Moments]:
-    """The network after one step against the gradient, and the moments to go on with; default betas, no decay."""
+def adam_step(network: Network, gradient: Any, opt_state: OptState, learning_rate: float) -> tuple[Network, OptState]:
+    """The network after one step against the gradient, and the opt_state to go on with; default betas, no decay."""
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to its integer count
-        change, moments = optax.adam(learning_rate).update(gradient, moments)
+        change, opt_state = optax.adam(learning_rate).update(gradient, opt_state)
     moved: Any = optax.apply_updates(network, change)  # pyright: ignore[reportArgumentType]
-    return moved, moments
+    return moved, opt_state
 
 
-def adam_count(moments: Moments) -> Int[Array, ""]:
-    """How many steps were taken with these moments."""
-    return optax.tree.get(moments, "count")
+def adam_count(opt_state: OptState) -> Int[Array, ""]:
+    """How many steps were taken with these opt_state."""
+    return optax.tree.get(opt_state, "count")

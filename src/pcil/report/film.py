@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pcil import envs, seeds
+from pcil.envs.rollout import Rollout
 from pcil.report.load import Collection, named
 from pcil.seeds import Stream
 from pcil.training.evaluate import playable
@@ -39,14 +40,12 @@ def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int =
     policy, env_kwargs = playable(folder, None, trust)
     with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=env_kwargs) as env:
         policy.check_fits(env)
-        obs, _ = env.reset(seed=seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0))
-        frames, over = [], False
-        while not over and len(frames) * every < steps:
-            frames.append(Image.fromarray(np.asarray(env.render())))
-            for _ in range(every):
-                if not over:
-                    obs, _, terminated, truncated, _ = env.step(policy(obs))
-                    over = terminated or truncated
+        rollout = Rollout([env], [seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)], ["the filmed episode"])
+        frames = []
+        while rollout.playing and rollout.lengths[0] < steps:
+            if rollout.lengths[0] % every == 0:
+                frames.append(Image.fromarray(np.asarray(env.render())))
+            rollout.step([policy(rollout.obs[0])])
         milliseconds = round(1000 * every / env.unwrapped.metadata.get("render_fps", 30))
     file = io.BytesIO()
     frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, quality=50)

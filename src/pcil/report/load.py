@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from pcil.errors import InputError, brief, shown
-from pcil.files import parse_json, read_json, read_text
+from pcil.files import flat, parse_json, read_json, read_text
 from pcil.report.variants import LONGEST, variants
 
 OFFLINE = ("bc",)
@@ -270,15 +270,6 @@ def _evaluations(folder: Path) -> tuple[dict[str, np.ndarray], bool]:
     if half and last.sum() < first.sum():
         columns = {name: column[~last] for name, column in columns.items()}
     return columns, bool(half)
-
-
-def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names; an environment's arguments are one value."""
-    values = {}
-    for name, value in settings.items():
-        nested = isinstance(value, dict) and name != "env_kwargs"
-        values |= flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
-    return values
 
 
 def plain(text: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,14 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from pcil import compilation, envs, modules, seeds
-from pcil.errors import WHOLE, InputError
+from pcil.errors import InputError
+from pcil.files import flat
 from pcil.report.embedding import project
-from pcil.report.load import Collection, Dot, Point, Source, flat, named, place
+from pcil.report.load import Collection, Dot, Point, Source, named, place
 from pcil.rewards import Reward
 from pcil.seeds import Stream
-from pcil.training import learner, loop, presets, runs
-from pcil.training.config import REGISTRIES, Run, registered
-from pcil.types import Episode
+from pcil.training import learner, runs, state
+from pcil.training.callbacks import Callback
+from pcil.training.collect import play
+from pcil.training.config import Run
+from pcil.types import Batch, Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
 """As many transitions as the paper's Figure 4 has."""
@@ -53,59 +55,46 @@ def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[D
 
     Empty where the run's reward has no representation; `InputError` where it can't be restored.
     """
-    run = restored(source.settings)
+    run = Run.from_json(source.settings)
     if type(run.reward).representation is Reward.representation:
         return []
     modules.admit(f"The run in {source.folder}", modules.of_task(run.task, run.env_kwargs), trust)
     demos = runs.demonstrations(run)
     assert demos is not None
     with envs.opened(run.task, env_kwargs=run.env_kwargs) as env:
-        fresh = jax.eval_shape(lambda: loop.start(run, envs.spec(env), demos.episodes).learner)
+        fresh = jax.eval_shape(lambda: state.start(run, envs.spec(env), demos.episodes).learner)
         if (numbers := sum(leaf.size for leaf in jax.tree.leaves(fresh))) > NUMBERS:
             raise InputError(
                 f"The run in {source.folder} has networks of {numbers:,} numbers; at most {NUMBERS:,} are restored."
             )
-        state, _ = loop.resume(run, source.folder, loop.start(run, envs.spec(env), demos.episodes), lambda text: None)
-        if not state.counters.episodes:
+        restored, _ = state.resume(run, source.folder, state.start(run, envs.spec(env), demos.episodes), Callback())
+        if not restored.counters.episodes:
             raise InputError(f"{source.folder} holds no checkpoint that can be read.")
-        rng = seeds.rng(run.seed, Stream.SAMPLE, state.counters.episodes)
-        frames = state.counters.frames
-        episode = loop.play(dataclasses.replace(run, update_every=WHOLE), env, envs.spec(env), state)
-    embed = learner.frozen_embed(run.learner, state.learner.agent)
+        rng = seeds.rng(run.seed, Stream.SAMPLE, restored.counters.episodes)
+        frames = restored.counters.frames
+        played = play(run, [env], envs.spec(env), restored, learn=False)
+    embed = learner.frozen_embed(run.learner, restored.learner.agent)
     seen = []
-    for episodes, rows in ((demos.episodes, EXPERT_STEPS), ([episode], AGENT_STEPS)):
-        obs, action, reward = _steps(run, episodes, rows, rng)
-        embedded = run.reward.representation(state.learner.reward, jnp.asarray(obs), jnp.asarray(action), embed)
+    for episodes, rows in ((demos.episodes, EXPERT_STEPS), (played, AGENT_STEPS)):
+        batch, reward = _steps(run, episodes, rows, rng)
+        embedded = run.reward.representation(restored.learner.reward, batch, embed)
         seen.append((np.asarray(embedded), reward))
     (expert, _), (agent, reward) = seen
     return project(expert, agent, reward, row._replace(frames=frames))
 
 
 def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
+    """Flat settings with those that they lack; as they are where no run has them."""
     try:
-        own = {f"{part}.class": registered(part, settings[f"{part}.class"]) for part in REGISTRIES}
-        return flat(_made(settings).plain.to_json()) | settings | own
-    except Exception:  # presets are made for settings of every kind, here of a file from anywhere
+        return flat(Run.from_json(settings).to_json())
+    except Exception:  # it checks settings of every kind, here of a file from anywhere
         return settings
 
 
-def restored(settings: dict[str, Any]) -> Run:
-    """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
-    run = _made(settings)
-    if flat(run.to_json()) != settings:
-        raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
-    return run
-
-
-def _made(settings: dict[str, Any]) -> Run:
-    return presets.make(**{name: value for name, value in settings.items() if not name.endswith(".class")})
-
-
-def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """So many random steps, none twice: the states that the reward reads, the actions, the environment's rewards."""
-    episodes = [loop.absorbed(run, episode) for episode in episodes]
-    part = slice(1, None) if run.reward.reads == "next_obs" else slice(None, -1)
-    kinds = zip(*((episode.obs[part], episode.action, episode.reward) for episode in episodes), strict=True)
+def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[Batch, np.ndarray]:
+    """So many random steps, none twice, and the environment's reward of each."""
+    episodes = [state.absorbed(run, episode) for episode in episodes]
+    columns = zip(*((*Batch.of(episode.obs, episode.action)[:3], episode.reward) for episode in episodes), strict=True)
     chosen = rng.permutation(sum(map(len, episodes)))[:rows]
-    return tuple(np.concatenate(arrays)[chosen] for arrays in kinds)
+    *steps, reward = (np.concatenate(arrays)[chosen] for arrays in columns)
+    return Batch(*map(jnp.asarray, steps)), reward

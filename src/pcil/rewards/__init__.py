@@ -1,7 +1,7 @@
 """Imitation rewards, one file each; `REWARDS` is the list that tests, the command line and the docs read."""
 
 from pcil.rewards.adversarial import DAC
-from pcil.rewards.base import Embed, Metrics, Reward, label, states_read
+from pcil.rewards.base import Embed, Inputs, Metrics, Reward, label, select
 from pcil.rewards.pcil import PCIL
 from pcil.rewards.pwil import PWIL
 from pcil.rewards.sil import POTIL, SIL
@@ -28,9 +28,10 @@ __all__ = [
     "SIL",
     "TCN",
     "Embed",
+    "Inputs",
     "Metrics",
     "Reward",
     "TaskReward",
     "label",
-    "states_read",
+    "select",
 ]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Literal
 
 import equinox as eqx
 import jax
@@ -19,24 +18,24 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.errors import check_ranges
 from pcil.nets.losses import binary_cross_entropy, gradient_penalty, interpolate
 from pcil.nets.networks import MLP
-from pcil.nets.optimiser import Moments, adam_init, adam_step
-from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.types import Batch, Window
+from pcil.nets.optimiser import OptState, adam_init, adam_step
+from pcil.rewards.base import Embed, Inputs, Metrics, Reward, select
+from pcil.types import Batch
 
 
 class DiscriminatorState(eqx.Module):
-    """The discriminator and its optimiser's moments."""
+    """The discriminator and its optimiser's opt_state."""
 
     discriminator: MLP
-    moments: Moments
+    opt_state: OptState
 
 
 @dataclass(frozen=True)
 class DAC(Reward):
     """Settings of DAC's reward: `log D - log(1 - D)`, which is the logit itself, so it is never computed by logarithms."""
 
-    inputs: Literal["state", "state-action"] = "state"
-    """What is told apart: the states that steps led to, or states with the actions taken in them."""
+    inputs: Inputs = "state"
+    """What is told apart: the states that steps led to, states with the actions taken in them, or both states of a step."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the logit."""
     hidden: int = 256
@@ -48,18 +47,8 @@ class DAC(Reward):
         super().__post_init__()
         check_ranges(self, batch_size=(1, inf), penalty=(0, inf), hidden=(1, inf), learning_rate=(0, 1))
 
-    @property
-    def reads(self) -> Literal["obs", "next_obs"]:
-        return "obs" if self.inputs == "state-action" else "next_obs"
-
-    def seen(
-        self, obs: Float[Array, "batch obs"], action: Float[Array, "batch action"], embed: Embed
-    ) -> Float[Array, "batch inputs"]:
-        """What the discriminator is given for these steps."""
-        return jnp.concatenate([embed(obs), action], axis=-1) if self.inputs == "state-action" else embed(obs)
-
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> DiscriminatorState:
-        width = jax.eval_shape(lambda demo: self.seen(demo.obs, demo.action, embed), demos[0]).shape[-1]
+        width = jax.eval_shape(lambda demo: select(self.inputs, demo, embed), demos[0]).shape[-1]
         discriminator = MLP.init((width, self.hidden, self.hidden, 1), key=key)
         return DiscriminatorState(discriminator, adam_init(discriminator))
 
@@ -88,27 +77,17 @@ class DAC(Reward):
         return entropy + self.penalty * slope, metrics
 
     def update(
-        self, state: DiscriminatorState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: DiscriminatorState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[DiscriminatorState, Metrics]:
-        seen = (self.seen(jnp.asarray(w.obs[:, 0]), jnp.asarray(w.action[:, 0]), embed) for w in (expert, agent))
-        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *seen, key=key)
-        return DiscriminatorState(*adam_step(state.discriminator, gradient, state.moments, self.learning_rate)), metrics
+        inputs = (select(self.inputs, batch.first, embed) for batch in (expert, agent))
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.discriminator, *inputs, key=key)
+        return DiscriminatorState(*adam_step(state.discriminator, gradient, state.opt_state, self.learning_rate)), metrics
 
-    def reward(
-        self,
-        state: DiscriminatorState,
-        obs: Float[Array, "T obs"],
-        action: Float[Array, "T action"],
-        embed: Embed,
-        *,
-        key: PRNGKeyArray,
-    ) -> Float[Array, " T"]:
+    def reward(self, state: DiscriminatorState, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Float[Array, " T"]:
         del key
-        return state.discriminator(self.seen(obs, action, embed))[:, 0]
+        return state.discriminator(select(self.inputs, batch, embed))[:, 0]
 
-    def representation(
-        self, state: DiscriminatorState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
-    ) -> Float[Array, "T hidden"]:
+    def representation(self, state: DiscriminatorState, batch: Batch, embed: Embed) -> Float[Array, "T hidden"]:
         """The discriminator's last hidden layer (paper section 4.3)."""
         whole = state.discriminator
-        return jax.nn.relu(MLP(whole.weights[:-1], whole.biases[:-1])(self.seen(obs, action, embed)))
+        return jax.nn.relu(MLP(whole.weights[:-1], whole.biases[:-1])(select(self.inputs, batch, embed)))

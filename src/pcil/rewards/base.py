@@ -14,11 +14,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_kinds, check_ranges
-from pcil.types import Batch, Window
+from pcil.types import Batch
 
 Metrics = dict[str, Float[Array, ""]]
+Inputs = Literal["state", "state-action", "transition"]
+"""What a reward is a function of: the state that a step led to, the state and the action taken there, or both states."""
 Embed = Callable[[Float[Array, "*batch obs"]], Float[Array, "*batch features"]]
 """The agent's features of an observation; no gradient flows through them. It is a pytree, so a state may keep it."""
+
+
+def select(inputs: Inputs, batch: Batch, embed: Embed) -> Float[Any, "*steps inputs"]:
+    """The features of the steps' `inputs`, actions as they are."""
+    if inputs == "state":
+        return embed(batch.next_obs)
+    other = batch.action if inputs == "state-action" else embed(batch.next_obs)
+    return jnp.concatenate([embed(batch.obs), other], axis=-1)
 
 
 class SlowFeatures(eqx.Module):
@@ -61,22 +71,17 @@ class Reward(abc.ABC):
         check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf))
 
     @property
-    def reads(self) -> Literal["obs", "next_obs"]:
-        """Which state of a step `reward` is given: the one that the step led to, or the one in which the action was taken,
-        which is what a reward of state-action pairs needs."""
-        return "next_obs"
-
-    @property
     def needs_actions(self) -> bool:
-        """Whether actions of demonstrations are read: by a reward of state-action pairs, or where the replay begins with them.
+        """Whether actions of demonstrations are read: by a reward whose `inputs` are state and action, or where the replay
+        begins with demonstrations.
 
         A reward that reads them in another way overrides this; where it is False, demonstrations may have no actions, and those
         that it is given are 0.
         """
-        return self.reads == "obs" or self.prefill[0] > 0
+        return getattr(self, "inputs", None) == "state-action" or self.prefill[0] > 0
 
     @property
-    def features(self) -> Literal["critic", "actor"]:
+    def trunk(self) -> Literal["critic", "actor"]:
         """Whose trunk `embed` is."""
         return "critic"
 
@@ -92,72 +97,47 @@ class Reward(abc.ABC):
 
     @abc.abstractmethod
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> Any:
-        """The state before the first update; `demos` has the states that the reward `reads` and the actions of each
-        demonstration, in the order of time.
+        """The state before the first update; `demos` are the steps `[T]` of each demonstration.
 
         It is compiled, so it computes with JAX.
         """
 
     @abc.abstractmethod
-    def update(self, state: Any, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:
-        """One gradient step on `batch_size` windows of the expert and as many of the agent."""
+    def update(self, state: Any, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[Any, Metrics]:
+        """One gradient step on `batch_size` windows of the expert and as many of the agent, each of at least `span` steps."""
 
     @abc.abstractmethod
-    def reward(
-        self,
-        state: Any,
-        obs: Float[Array, "T obs"],
-        action: Float[Array, "T action"],
-        embed: Embed,
-        *,
-        key: PRNGKeyArray,
-    ) -> Float[Array, " T"]:
-        """The reward of `T` steps; which state `obs` holds is said by `reads`."""
+    def reward(self, state: Any, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Float[Array, " T"]:
+        """The learned reward of `T` steps."""
 
-    def after_episode(
-        self,
-        state: Any,
-        obs: Float[Array, "T obs"],
-        action: Float[Array, "T action"],
-        embed: Embed,
-        *,
-        key: PRNGKeyArray,
-    ) -> Any:
+    def after_episode(self, state: Any, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Any:
         """The state once an episode has ended and before it is labelled, where `scope` is "episode".
 
         All arguments are those that `reward` is given next for the same episode, the key among them.
         """
-        del obs, action, embed, key
+        del batch, embed, key
         return state
 
-    def representation(
-        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
-    ) -> Float[Array, "T dim"] | None:
-        """Where the reward has put `T` steps, if it learns a representation; given what `reward` is given."""
-        del state, obs, action, embed
+    def representation(self, state: Any, batch: Batch, embed: Embed) -> Float[Array, "T dim"] | None:
+        """Where the reward has put `T` steps, if it learns a representation."""
+        del state, batch, embed
         return None
 
-
-def states_read(settings: Reward, obs: Float[Any, "*batch states obs"]) -> Float[Any, "*batch n obs"]:
-    """The states that a reward `reads`, one a step."""
-    return obs[..., 1:, :] if settings.reads == "next_obs" else obs[..., :-1, :]
+    def total(self, learned: Float[Any, "*steps"], task_reward: Float[Any, "*steps"]) -> Float[Any, "*steps"]:
+        """What the agent is trained on: the learned reward plus the environment's, weighted."""
+        return learned + self.task_weight * task_reward if self.task_weight else learned  # 0 * NaN would be NaN
 
 
 def label(
     settings: Reward,
     state: Any,
-    obs: Float[Array, "*batch states obs"],
-    action: Float[Array, "*batch n action"],
-    task_reward: Float[Array, "*batch n"],
+    batch: Batch,
+    task_reward: Float[Array, "*steps"],
     embed: Embed,
     *,
     key: PRNGKeyArray,
-) -> Float[Array, "*batch n"]:
-    """What the agent is trained on: the learned reward plus the weighted reward of the environment.
-
-    This is the one place where the two meet. Leading dimensions are flattened, so a reward sees rows of steps only.
-    """
-    rows, row_actions = states_read(settings, obs).reshape(-1, obs.shape[-1]), action.reshape(-1, action.shape[-1])
-    learned = settings.reward(state, rows, row_actions, embed, key=key)
-    learned = learned.reshape(task_reward.shape)
-    return learned + settings.task_weight * task_reward if settings.task_weight else learned  # 0 * NaN would be NaN
+) -> Float[Array, "*steps"]:
+    """The `total` reward of the steps; leading axes are flattened, so that `reward` is given rows of steps only."""
+    rows = Batch(*(array.reshape(-1, array.shape[-1]) for array in batch[:3]))
+    learned = settings.reward(state, rows, embed, key=key)
+    return settings.total(learned.reshape(task_reward.shape), task_reward)

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.nets.losses import binary_cross_entropy
 from pcil.nets.networks import MLP, unit_sphere
-from pcil.nets.optimiser import Moments, adam_init, adam_step
-from pcil.rewards.base import Embed, Metrics
+from pcil.nets.optimiser import OptState, adam_init, adam_step
+from pcil.rewards.base import Embed, Inputs, Metrics, select
 from pcil.types import Batch
 
 Head = Literal["similarity", "gail"]
@@ -21,30 +21,31 @@ Head = Literal["similarity", "gail"]
 
 
 class Classifier(eqx.Module):
-    """A linear classifier of embeddings, expert or agent, and its optimiser's moments."""
+    """A linear classifier of embeddings, expert or agent, and its optimiser's opt_state."""
 
     linear: MLP
-    moments: Moments
+    opt_state: OptState
 
 
 class EmbeddingState(eqx.Module):
-    """The encoder, its optimiser's moments, the expert states that rewards compare with, and the head that learns, if any."""
+    """The encoder, its optimiser's opt_state, the expert states that rewards compare with, and the head that learns, if any."""
 
     encoder: MLP
-    moments: Moments
-    reference: Float[Array, "batch obs"]
-    """The last batch of expert states: partners of PCIL's penalty and of the similarity reward."""
+    opt_state: OptState
+    reference: Batch
+    """The last batch of expert steps: partners of PCIL's penalty and of the similarity reward."""
     classifier: Classifier | None
 
 
 def init_embedding(
-    demos: Sequence[Batch], embed: Embed, *, hidden: int, batch_size: int, head: Head, key: PRNGKeyArray
+    demos: Sequence[Batch], embed: Embed, inputs: Inputs, *, hidden: int, batch_size: int, head: Head, key: PRNGKeyArray
 ) -> EmbeddingState:
     """Three hidden layers and a quarter of their width as output (256-256-256-64: paper Appendix B); random references."""
     encoder_key, reference_key, head_key = jax.random.split(key, 3)
-    states = jnp.concatenate([demo.obs for demo in demos])
-    reference = states[jax.random.randint(reference_key, (batch_size,), 0, states.shape[0])]
-    features = jax.eval_shape(embed, reference).shape[-1]
+    steps = Batch(*(jnp.concatenate(arrays) for arrays in zip(*(demo[:3] for demo in demos), strict=True)))
+    rows = jax.random.randint(reference_key, (batch_size,), 0, steps.obs.shape[0])
+    reference = Batch(*(array[rows] for array in steps[:3]))
+    features = jax.eval_shape(lambda: select(inputs, reference, embed)).shape[-1]
     encoder = MLP.init((features, hidden, hidden, hidden, hidden // 4), key=encoder_key)
     linear = MLP.init((hidden // 4, 1), key=head_key) if head == "gail" else None
     return EmbeddingState(encoder, adam_init(encoder), reference, linear and Classifier(linear, adam_init(linear)))
@@ -53,7 +54,7 @@ def init_embedding(
 def advance(
     state: EmbeddingState,
     gradient: MLP,
-    reference: Float[Array, "batch obs"],
+    reference: Batch,
     features: Sequence[Float[Array, "batch features"]],
     learning_rate: float,
 ) -> tuple[EmbeddingState, Metrics]:
@@ -62,9 +63,9 @@ def advance(
     The classifier learns from the embeddings of expert and agent `features` as they were before this step, with label 1 for
     the expert. They are its data: no gradient flows through them into the encoder (paper section 4.4).
     """
-    encoder, moments = adam_step(state.encoder, gradient, state.moments, learning_rate)
+    encoder, opt_state = adam_step(state.encoder, gradient, state.opt_state, learning_rate)
     if state.classifier is None:
-        return EmbeddingState(encoder, moments, reference, None), {}
+        return EmbeddingState(encoder, opt_state, reference, None), {}
     expert, agent = jnp.split(unit_sphere(state.encoder(jnp.concatenate(features))), [len(features[0])])
 
     def loss(linear: MLP) -> tuple[Float[Array, ""], Metrics]:
@@ -73,23 +74,23 @@ def advance(
         return entropy, {"head_loss": entropy, "expert_logit": jnp.mean(logits[0]), "agent_logit": jnp.mean(logits[1])}
 
     slope, metrics = jax.grad(loss, has_aux=True)(state.classifier.linear)
-    classifier = Classifier(*adam_step(state.classifier.linear, slope, state.classifier.moments, learning_rate))
-    return EmbeddingState(encoder, moments, reference, classifier), metrics
+    classifier = Classifier(*adam_step(state.classifier.linear, slope, state.classifier.opt_state, learning_rate))
+    return EmbeddingState(encoder, opt_state, reference, classifier), metrics
 
 
-def embedding(state: EmbeddingState, obs: Float[Array, "T obs"], embed: Embed) -> Float[Array, "T dim"]:
-    """`Phi(s)`, on the unit sphere."""
-    return unit_sphere(state.encoder(embed(obs)))
+def embedding(state: EmbeddingState, batch: Batch, embed: Embed, inputs: Inputs) -> Float[Array, "T dim"]:
+    """`Phi` of the steps' inputs, on the unit sphere."""
+    return unit_sphere(state.encoder(select(inputs, batch, embed)))
 
 
 def embedding_reward(
-    state: EmbeddingState, obs: Float[Array, "T obs"], embed: Embed, compare: Literal["random", "mean"]
+    state: EmbeddingState, batch: Batch, embed: Embed, inputs: Inputs, compare: Literal["random", "mean"]
 ) -> Float[Array, " T"]:
     """The head's reward: the similarity, or `log D - log(1 - D)`, which is the classifier's logit itself."""
     if state.classifier is not None:
-        return state.classifier.linear(embedding(state, obs, embed))[:, 0]
-    both = embedding(state, jnp.concatenate([state.reference, obs]), embed)
-    expert, agent = jnp.split(both, [state.reference.shape[0]])
+        return state.classifier.linear(embedding(state, batch, embed, inputs))[:, 0]
+    both = Batch(*(jnp.concatenate(arrays) for arrays in zip(state.reference[:3], batch[:3], strict=True)))
+    expert, agent = jnp.split(embedding(state, both, embed, inputs), [state.reference.obs.shape[0]])
     return similarity(agent, expert, compare)
 
 

@@ -19,15 +19,17 @@ from pcil.errors import check_ranges
 from pcil.nets.losses import gradient_penalty, group_info_nce, info_nce, interpolate
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.nets.optimiser import adam_count
-from pcil.rewards.base import Embed, Metrics, Reward
+from pcil.rewards.base import Embed, Inputs, Metrics, Reward, select
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
-from pcil.types import Batch, Window
+from pcil.types import Batch
 
 
 @dataclass(frozen=True)
 class PCIL(Reward):
     """Settings of PCIL's reward."""
 
+    inputs: Inputs = "state"
+    """What is embedded: the states that steps led to, states with the actions taken in them, or both states of a step."""
     temperature: float = 1.0
     """Divides the cosines inside the InfoNCE loss."""
     compare: Literal["random", "mean"] = "random"
@@ -53,7 +55,8 @@ class PCIL(Reward):
         check_ranges(self, stage_weight=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf))
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
-        return init_embedding(demos, embed, hidden=self.hidden, batch_size=self.batch_size, head=self.head, key=key)
+        sizes: Any = {"hidden": self.hidden, "batch_size": self.batch_size, "head": self.head}
+        return init_embedding(demos, embed, self.inputs, **sizes, key=key)
 
     def loss(
         self,
@@ -63,7 +66,7 @@ class PCIL(Reward):
         partner: Float[Array, "batch features"],
         *,
         key: PRNGKeyArray,
-        number: Int[Array, " batch"] | None = None,
+        episode_id: Int[Array, " batch"] | None = None,
         count: int | Array = 0,
     ) -> tuple[Float[Array, ""], Metrics]:
         """InfoNCE with expert anchors and all agent samples as negatives, plus the penalty on the reward's slope.
@@ -71,7 +74,7 @@ class PCIL(Reward):
         An anchor's positive is one random other row of the expert batch. The penalty is taken on the features between an
         expert and an agent row; its scalar is `Phi(mix) . Phi(partner)`, the reward, with the partner's side held fixed.
         `count` updates came before; a lazy penalty is computed at every `penalty_every`-th and then weighs as many times more.
-        `number`, the agent rows' episodes, is needed for anchors on the agent's stages alone.
+        `episode_id`, that of the agent's rows, is needed for anchors on the agent's stages alone.
         """
         shift_key, mix_key = jax.random.split(key)
         raw = encoder(jnp.concatenate([expert, agent]))
@@ -98,32 +101,26 @@ class PCIL(Reward):
         }
         loss = loss + self.penalty * penalty
         if self.stages and self.stage_weight:
-            assert number is not None
-            metrics["stage_loss"] = group_info_nce(negatives, stages(number, self.stages), anchor, self.temperature)
+            assert episode_id is not None
+            metrics["stage_loss"] = group_info_nce(negatives, stages(episode_id, self.stages), anchor, self.temperature)
             loss = loss + self.stage_weight * metrics["stage_loss"]
         return loss, metrics
 
     def update(
-        self, state: EmbeddingState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: EmbeddingState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[EmbeddingState, Metrics]:
-        states, number = jnp.asarray(expert.obs[:, 0]), jnp.asarray(agent.number)
-        features = [embed(obs) for obs in (states, jnp.asarray(agent.obs[:, 0]), state.reference)]
-        gradient_of = jax.grad(self.loss, has_aux=True)
-        gradient, metrics = gradient_of(state.encoder, *features, key=key, number=number, count=adam_count(state.moments))
-        state, more = advance(state, gradient, states, features[:2], self.learning_rate)
+        features = [select(self.inputs, batch, embed) for batch in (expert.first, agent.first, state.reference)]
+        others: Any = {"episode_id": agent.episode_id, "count": adam_count(state.opt_state), "key": key}
+        gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, **others)
+        state, more = advance(state, gradient, expert.first, features[:2], self.learning_rate)
         return state, metrics | more
 
-    def reward(
-        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
-        del action, key
-        return embedding_reward(state, obs, embed, self.compare)
+    def reward(self, state: EmbeddingState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
+        del key
+        return embedding_reward(state, batch, embed, self.inputs, self.compare)
 
-    def representation(
-        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
-    ) -> Float[Array, "T dim"]:
-        del action
-        return embedding(state, obs, embed)
+    def representation(self, state: EmbeddingState, batch: Batch, embed: Embed) -> Float[Array, "T dim"]:
+        return embedding(state, batch, embed, self.inputs)
 
 
 def derangement(key: PRNGKeyArray, size: int) -> Array:
@@ -132,11 +129,11 @@ def derangement(key: PRNGKeyArray, size: int) -> Array:
     return jnp.zeros(size, order.dtype).at[order].set(jnp.roll(order, 1))
 
 
-def stages(number: Int[Array, " batch"], count: int) -> Int[Array, " batch"]:
-    """The stage of training, from 0 to `count - 1`, that each row's policy is from, by the number of the row's episode.
+def stages(episode_id: Int[Array, " batch"], count: int) -> Int[Array, " batch"]:
+    """The stage of training, from 0 to `count - 1`, that each row's policy is from, by the row's episode.
 
     A row of which a share `q` of the batch is from earlier episodes is in stage `floor(count q)`: the stages are quantiles of
     the batch, and rows of one episode, thus of about one policy, are never parted.
     """
-    earlier = jnp.sum(number[None, :] < number[:, None], axis=1)
-    return earlier * count // len(number)
+    earlier = jnp.sum(episode_id[None, :] < episode_id[:, None], axis=1)
+    return earlier * count // len(episode_id)

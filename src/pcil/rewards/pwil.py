@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
 from pcil.nets.networks import Normalizer, Scaler
-from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
-from pcil.types import Batch, Window
+from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures, select
+from pcil.types import Batch
 
 
 class PWILState(eqx.Module):
@@ -97,20 +97,16 @@ class PWIL(Reward):
         check_ranges(self, alpha=(1e-6, inf), beta=(0, inf), subsampling=(1, inf), refresh=(1, inf), prefill_steps=(0, inf))
 
     @property
-    def reads(self) -> Literal["obs", "next_obs"]:
-        return "obs" if self.inputs == "state-action" else "next_obs"
-
-    @property
-    def features(self) -> Literal["critic", "actor"]:
+    def trunk(self) -> Literal["critic", "actor"]:
         return "actor"
 
     @property
     def prefill(self) -> tuple[int, float]:
         return self.prefill_steps, self.alpha
 
-    def seen(self, obs: Float[Array, "T obs"], action: Float[Array, "T action"]) -> Float[Array, "T inputs"]:
-        """What is coupled, as it comes."""
-        return jnp.concatenate([obs, action], axis=-1) if self.inputs == "state-action" else obs
+    def points(self, batch: Batch) -> Float[Any, "T inputs"]:
+        """What is coupled, in the environment's units."""
+        return select("state" if self.inputs == "trunk" else self.inputs, batch, lambda obs: obs)
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> PWILState:
         offsets = jax.random.randint(key, (len(demos),), 0, self.subsampling)
@@ -118,8 +114,7 @@ class PWIL(Reward):
         for demo, offset in zip(demos, offsets, strict=True):
             steps = len(demo.obs)
             rows = offset + self.subsampling * jnp.arange(max(steps // self.subsampling, 1))
-            seen = self.seen(jnp.asarray(demo.obs), jnp.asarray(demo.action))
-            chosen.append(seen[jnp.minimum(rows, steps - 1)])
+            chosen.append(self.points(demo)[jnp.minimum(rows, steps - 1)])
         atoms = jnp.concatenate(chosen)
         scale = Scaler.init(atoms.shape[1]).update(atoms).normalizer
         slow = SlowFeatures.init(embed) if self.inputs == "trunk" else None
@@ -127,27 +122,19 @@ class PWIL(Reward):
         return PWILState(atoms, scale.mean[None], scale.deviation[None], horizon, slow)
 
     def update(
-        self, state: PWILState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: PWILState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[PWILState, Metrics]:
         del expert, agent, key
         slow = state.slow and state.slow.update(embed, self.refresh)
         return PWILState(state.atoms, state.mean, state.deviation, state.horizon, slow), {}
 
-    def reward(
-        self,
-        state: PWILState,
-        obs: Float[Array, "T obs"],
-        action: Float[Array, "T action"],
-        embed: Embed,
-        *,
-        key: PRNGKeyArray,
-    ) -> Float[Array, " T"]:
+    def reward(self, state: PWILState, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Float[Array, " T"]:
         """A step has `1 / horizon` of the mass, so `sigma c` is `beta / sqrt(dimensions)` times the mean distance it moves."""
         del embed, key
-        both = state.atoms, self.seen(obs, action)
+        both = state.atoms, self.points(batch)
         if state.slow is None:
             atoms, points = map(Normalizer(state.mean[0], state.deviation[0]), both)
-            dimensions = obs.shape[-1] + action.shape[-1]
+            dimensions = batch.obs.shape[-1] + batch.action.shape[-1]
         else:
             atoms, points = (state.slow.embed(x) for x in both)
             dimensions = atoms.shape[-1]

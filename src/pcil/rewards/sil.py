@@ -19,17 +19,17 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from pcil.errors import check_ranges
 from pcil.nets.networks import MLP, unit_sphere
-from pcil.nets.optimiser import Moments, adam_init, adam_step
+from pcil.nets.optimiser import OptState, adam_init, adam_step
 from pcil.nets.transport import sinkhorn_plan
-from pcil.rewards.base import Embed, Metrics, Reward, SlowFeatures
-from pcil.types import Batch, Window
+from pcil.rewards.base import Embed, Inputs, Metrics, Reward, SlowFeatures, select
+from pcil.types import Batch
 
 
 class Demos(eqx.Module):
     """All demonstrations, padded to the longest."""
 
-    obs: Float[Array, "demos steps obs"]
-    action: Float[Array, "demos steps action"]
+    steps: Batch
+    """`[demos, steps]`."""
     weight: Float[Array, "demos steps"]
     """One over a demonstration's length, and 0 in its padding."""
 
@@ -37,9 +37,12 @@ class Demos(eqx.Module):
     def of(cls, demos: Sequence[Batch]) -> Demos:
         longest = max(len(demo.obs) for demo in demos)
         weights = [jnp.full((len(demo.obs), 1), 1 / len(demo.obs), jnp.float32) for demo in demos]
-        columns = [demo.obs for demo in demos], [demo.action for demo in demos], weights
-        obs, action, weight = (jnp.stack([jnp.pad(x, ((0, longest - len(x)), (0, 0))) for x in part]) for part in columns)
-        return cls(obs, action, weight[..., 0])
+        columns = *zip(*(demo[:3] for demo in demos), strict=True), weights
+        *steps, weight = (jnp.stack([jnp.pad(x, ((0, longest - len(x)), (0, 0))) for x in part]) for part in columns)
+        return cls(Batch(*steps), weight[..., 0])
+
+    def __getitem__(self, index: Any) -> Demos:
+        return jax.tree.map(lambda array: array[index], self)
 
 
 def step_weights(action: Float[Array, "T action"]) -> Float[Array, " T"]:
@@ -82,9 +85,7 @@ class SinkhornReward(Reward):
         check_ranges(self, epsilon=(3e-3, inf), iterations=(1, inf), first_sum=(-inf, 0))
 
     @abc.abstractmethod
-    def costs(
-        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
+    def costs(self, state: Any, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
         """Each step's part of the transport cost."""
 
     def match(
@@ -99,20 +100,16 @@ class SinkhornReward(Reward):
         plan = sinkhorn_plan(cost, x_weight, y_weight, self.epsilon, self.iterations)
         return jnp.sum(jnp.where(plan > 0, plan * cost, 0.0), axis=-1)
 
-    def reward(
-        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
-        return -jnp.where(state.scale > 0, state.scale, 1.0) * self.costs(state, obs, action, embed, key=key)
+    def reward(self, state: Any, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
+        return -jnp.where(state.scale > 0, state.scale, 1.0) * self.costs(state, batch, embed, key=key)
 
-    def after_episode(
-        self, state: Any, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Any:
+    def after_episode(self, state: Any, batch: Batch, embed: Embed, *, key: Any) -> Any:
         """Fix the scale by the first episode (authors' code: `auto_rew_scale`)."""
         if self.first_sum == 0:
             return state
 
         def by_this_episode() -> Array:
-            total = jnp.sum(self.costs(state, obs, action, embed, key=key))
+            total = jnp.sum(self.costs(state, batch, embed, key=key))
             return -self.first_sum / jnp.maximum(total, 1e-6)
 
         scale = jax.lax.cond(state.scale > 0, lambda: state.scale, by_this_episode)
@@ -120,10 +117,10 @@ class SinkhornReward(Reward):
 
 
 class Adversary(eqx.Module):
-    """The critic, its optimiser's moments, and what it did last."""
+    """The critic, its optimiser's opt_state, and what it did last."""
 
     critic: MLP
-    moments: Moments
+    opt_state: OptState
     cost: Float[Array, ""]
     """The transport cost at its last step."""
     updates: Int[Array, ""]
@@ -133,8 +130,9 @@ class Adversary(eqx.Module):
 class SIL(SinkhornReward):
     """Settings of SIL's reward: a critic learns the space, and each episode is compared with a random demonstration."""
 
-    inputs: Literal["state", "state-action"] = "state"
-    """What the critic is given: the features of states, or those and the actions taken there."""
+    inputs: Inputs = "state"
+    """What the critic is given: the features of the states that steps led to, of states with the actions taken in them, or of
+    both states of a step."""
     hidden: int = 128
     """Width of the critic's two hidden layers."""
     embedding: int = 30
@@ -148,18 +146,8 @@ class SIL(SinkhornReward):
         super().__post_init__()
         check_ranges(self, batch_size=(1, inf), hidden=(1, inf), embedding=(1, inf), learning_rate=(0, 1), every=(1, inf))
 
-    @property
-    def reads(self) -> Literal["obs", "next_obs"]:
-        return "obs" if self.inputs == "state-action" else "next_obs"
-
-    def seen(
-        self, obs: Float[Array, "rows obs"], action: Float[Array, "rows action"], embed: Embed
-    ) -> Float[Array, "rows inputs"]:
-        """What the critic is given for these steps."""
-        return jnp.concatenate([embed(obs), action], axis=-1) if self.inputs == "state-action" else embed(obs)
-
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> SinkhornState:
-        width = jax.eval_shape(lambda demo: self.seen(demo.obs, demo.action, embed), demos[0]).shape[-1]
+        width = jax.eval_shape(lambda demo: select(self.inputs, demo, embed), demos[0]).shape[-1]
         critic = MLP.init((width, self.hidden, self.hidden, self.embedding), key=key)
         adversary = Adversary(critic, adam_init(critic), jnp.zeros(()), jnp.int32(0))
         return SinkhornState(Demos.of(demos), jnp.zeros(()), adversary)
@@ -175,31 +163,28 @@ class SIL(SinkhornReward):
         return -jnp.sum(plan * cosine_cost(critic(agent), critic(expert)))
 
     def update(
-        self, state: SinkhornState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: SinkhornState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[SinkhornState, Metrics]:
         del key
         old: Adversary = state.space
-        x, y = (self.seen(jnp.asarray(w.obs[:, 0]), jnp.asarray(w.action[:, 0]), embed) for w in (agent, expert))
+        x, y = (select(self.inputs, batch.first, embed) for batch in (agent, expert))
 
         def learn() -> Adversary:
             cost = cosine_cost(old.critic(x), old.critic(y))
             x_weight, y_weight = (jnp.full(len(rows), 1 / len(rows)) for rows in (x, y))
             plan = sinkhorn_plan(cost, x_weight, y_weight, self.epsilon, self.iterations)
             loss, gradient = jax.value_and_grad(self.loss)(old.critic, x, y, plan)
-            critic, moments = adam_step(old.critic, gradient, old.moments, self.learning_rate)
-            return Adversary(critic, moments, -loss, old.updates)
+            critic, opt_state = adam_step(old.critic, gradient, old.opt_state, self.learning_rate)
+            return Adversary(critic, opt_state, -loss, old.updates)
 
         new = jax.lax.cond(old.updates % self.every == 0, learn, lambda: old)
-        new = Adversary(new.critic, new.moments, new.cost, old.updates + 1)
+        new = Adversary(new.critic, new.opt_state, new.cost, old.updates + 1)
         return SinkhornState(state.demos, state.scale, new), {"transport_cost": new.cost}
 
-    def costs(
-        self, state: SinkhornState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
-        demos, which = state.demos, jax.random.randint(key, (), 0, len(state.demos.obs))
-        both = self.seen(obs, action, embed), self.seen(demos.obs[which], demos.action[which], embed)
-        x, y = (state.space.critic(seen) for seen in both)
-        return self.match(x, y, step_weights(action), demos.weight[which])
+    def costs(self, state: SinkhornState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
+        demo = state.demos[jax.random.randint(key, (), 0, len(state.demos.weight))]
+        x, y = (state.space.critic(select(self.inputs, steps, embed)) for steps in (batch, demo.steps))
+        return self.match(x, y, step_weights(batch.action), demo.weight)
 
 
 @dataclass(frozen=True)
@@ -216,7 +201,7 @@ class POTIL(SinkhornReward):
         check_ranges(self, refresh=(1, inf))
 
     @property
-    def features(self) -> Literal["critic", "actor"]:
+    def trunk(self) -> Literal["critic", "actor"]:
         return "actor"
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> SinkhornState:
@@ -224,15 +209,14 @@ class POTIL(SinkhornReward):
         return SinkhornState(Demos.of(demos), jnp.zeros(()), SlowFeatures.init(embed))
 
     def update(
-        self, state: SinkhornState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: SinkhornState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[SinkhornState, Metrics]:
         del expert, agent, key
         return SinkhornState(state.demos, state.scale, state.space.update(embed, self.refresh)), {}
 
-    def costs(
-        self, state: SinkhornState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
+    def costs(self, state: SinkhornState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
         del embed, key
-        x, y, steps = state.space.embed(obs), state.space.embed(state.demos.obs), step_weights(action)
+        steps, demos = step_weights(batch.action), state.demos.steps
+        x, y = (select("state", some, state.space.embed) for some in (batch, demos))
         costs = jax.vmap(lambda demo, weight: self.match(x, demo, steps, weight))(y, state.demos.weight)
         return costs[jnp.argmin(jnp.sum(costs, axis=1))]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.rewards.base import Embed, Metrics, Reward
-from pcil.types import Batch, Window
+from pcil.types import Batch
 
 
 @dataclass(frozen=True)
@@ -27,18 +27,10 @@ class TaskReward(Reward):
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> None:
         del demos, embed, key
 
-    def update(self, state: None, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray) -> tuple[None, Metrics]:
+    def update(self, state: None, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray) -> tuple[None, Metrics]:
         del state, expert, agent, embed, key
         return None, {}
 
-    def reward(
-        self,
-        state: None,
-        obs: Float[Array, "T obs"],
-        action: Float[Array, "T action"],
-        embed: Embed,
-        *,
-        key: PRNGKeyArray,
-    ) -> Float[Array, " T"]:
-        del state, action, embed, key
-        return jnp.zeros(obs.shape[0], obs.dtype)
+    def reward(self, state: None, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Float[Array, " T"]:
+        del state, embed, key
+        return jnp.zeros(batch.obs.shape[0], batch.obs.dtype)

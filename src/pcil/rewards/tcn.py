@@ -20,7 +20,7 @@ from pcil.nets.losses import contrast, off_diagonal
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards.base import Embed, Metrics, Reward
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
-from pcil.types import Batch, Window
+from pcil.types import Batch
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class TCN(Reward):
         return 2 * self.margin if self.negatives == "rollout" else self.window
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
-        return init_embedding(demos, embed, hidden=self.hidden, batch_size=self.batch_size, head=self.head, key=key)
+        sizes: Any = {"hidden": self.hidden, "batch_size": self.batch_size, "head": self.head}
+        return init_embedding(demos, embed, "state", **sizes, key=key)
 
     def loss(
         self,
@@ -80,27 +81,24 @@ class TCN(Reward):
         return loss, metrics | {"contrast_loss": loss, "embedding_norm": jnp.mean(jnp.linalg.norm(raw, axis=-1))}
 
     def update(
-        self, state: EmbeddingState, expert: Window, agent: Window, embed: Embed, *, key: PRNGKeyArray
+        self, state: EmbeddingState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[EmbeddingState, Metrics]:
-        obs = jnp.concatenate([window.obs[:, : self.span + 1] for window in (expert, agent)])
-        goes_on = jnp.concatenate([window.discount[:, : self.span] for window in (expert, agent)]) > 0
+        both = expert, agent
+        obs = jnp.concatenate([jnp.concatenate([b.obs[:, :1], b.next_obs[:, : self.span]], axis=1) for b in both])
+        assert expert.discount is not None and agent.discount is not None
+        goes_on = jnp.concatenate([expert.discount[:, : self.span], agent.discount[:, : self.span]]) > 0
         rows, (first, last) = len(obs), (self.margin, 2 * self.margin + 1)
         step = jax.random.randint(key, (rows,), 1, self.window + 1)
         near = embed(jnp.stack([obs[:, 0], obs[jnp.arange(rows), step]]))  # behind an end, windows repeat its state
         far, real = embed(obs[:, first:last]), goes_on[:, first - 2 : last - 2]  # the end itself is real: hence the 2
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, near, far, real)
         anchors = jnp.split(near[0], [len(expert.obs)])
-        state, more = advance(state, gradient, jnp.asarray(expert.obs[:, 0]), anchors, self.learning_rate)
+        state, more = advance(state, gradient, expert.first, anchors, self.learning_rate)
         return state, metrics | more
 
-    def reward(
-        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed, *, key: Any
-    ) -> Float[Array, " T"]:
-        del action, key
-        return embedding_reward(state, obs, embed, self.compare)
+    def reward(self, state: EmbeddingState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
+        del key
+        return embedding_reward(state, batch, embed, "state", self.compare)
 
-    def representation(
-        self, state: EmbeddingState, obs: Float[Array, "T obs"], action: Float[Array, "T action"], embed: Embed
-    ) -> Float[Array, "T dim"]:
-        del action
-        return embedding(state, obs, embed)
+    def representation(self, state: EmbeddingState, batch: Batch, embed: Embed) -> Float[Array, "T dim"]:
+        return embedding(state, batch, embed, "state")

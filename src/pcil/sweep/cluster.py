@@ -29,7 +29,7 @@ class Cluster:
         return sum(min(int(node.get(kind, 0) // amount) for kind, amount in wanted.items() if amount) for node in nodes)
 
     def submit(self, job: Job) -> Any:
-        return self._task.options(name=job.name).remote(job.words, job.folder, job.log, Path.cwd(), self._plan.cores)
+        return self._task.options(name=job.name).remote(job.argv, job.folder, job.log, Path.cwd(), self._plan.cores)
 
     def poll(self, handle: Any) -> int | str | None:
         if not self._ray.wait([handle], timeout=0)[0]:

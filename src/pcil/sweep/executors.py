@@ -81,7 +81,7 @@ class Local:
         used = Counter(self._running.values())
         gpus = min(self._gpus, key=lambda gpus: used[gpus])
         variables = self._environment | ({"CUDA_VISIBLE_DEVICES": gpus} if gpus else {})
-        words = [*WORKER, str(job.folder), str(self._cores), *job.words]
+        words = [*WORKER, str(job.folder), str(self._cores), *job.argv]
         job.log.parent.mkdir(parents=True, exist_ok=True)
         with job.log.open("ab") as log:
             # In a process group of its own a terminal's Ctrl-C does not reach it: when it is to stop, the sweep says.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import json
 import os
@@ -12,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pcil import envs, files
-from pcil.cli import arguments
+from pcil import envs, files, modules
+from pcil.demos import Demonstrations
 from pcil.errors import InputError, brief
 from pcil.report.load import read_evaluations
-from pcil.training import runs
-from pcil.training.config import Run
+from pcil.training import presets, runs
+from pcil.training.config import REGISTRIES, Run, renamed
 
 PRODUCT: dict[str, Any] = {
     "tasks": ["walker_walk"],
@@ -38,9 +39,9 @@ class Job:
 
     name: str
     folder: Path
-    words: list[str]
-    """Those of `pcil train`."""
     run: Run
+    trust: tuple[str, ...]
+    """Modules of a person's own that the run names."""
     log: Path
     """What the run prints."""
     state: str = "waiting"
@@ -52,6 +53,12 @@ class Job:
     """Mean of the last evaluation."""
     deaths: int = 0
     """How often its process was killed."""
+
+    @property
+    def argv(self) -> list[str]:
+        """The arguments of `pcil train` that train this run."""
+        trust = ["--trust", *self.trust] if self.trust else []
+        return ["--settings", json.dumps(self.run.to_json()), "--out", str(self.folder), *trust]
 
     def look(self) -> None:
         """Read the folder; a file that is not there yet, or half written, changes nothing."""
@@ -93,18 +100,24 @@ def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str]
     if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
         given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
         raise InputError(f"{source} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
+    loaded: dict[str, Demonstrations] = {}
     for where, product in _products(source, table):
-        for name, words in _combinations(where, product):
+        for name, settings in _combinations(where, product):
             if any(job.name == name for job in plan.jobs):
                 raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
-            folder, found = out.absolute() / name, []
-            words.append(f"--out={folder}")
+            folder = out.absolute() / name
             try:
-                arguments.train(words, lambda run, out, found=found: found.append(run) or 0, trust)
-                runs.check(found[0], folder)
+                named = [("The task", modules.of_task(settings["task"], settings.get("env_kwargs")))]
+                named += [(f"--{part}", modules.of_class(settings.get(part))) for part in REGISTRIES]
+                for option, names in named:
+                    modules.admit(option, names, trust)
+                run = presets.make(**settings)
+                run = dataclasses.replace(run, task=envs.task_name(run.task))
+                runs.check(run, folder, loaded)
             except InputError as error:
                 raise InputError(f"{where}, {name}: {error}") from error
-            plan.jobs.append(Job(name, folder, words, found[0], folder.with_name(f"{folder.name}.log")))
+            own = tuple(dict.fromkeys(name for _, names in named for name in names))
+            plan.jobs.append(Job(name, folder, run, own, folder.with_name(f"{folder.name}.log")))
             plan.jobs[-1].look()
     if not plan.jobs:
         raise InputError(f"{source} has no runs; give it tasks, methods and seeds, or [[runs]] with them.")
@@ -122,8 +135,8 @@ def _products(file: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str,
         yield where, {**shared, **product, "settings": _flat(shared.get("settings", {})) | _flat(product.get("settings", {}))}
 
 
-def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, list[str]]]:
-    """Folder and words of each run: variants x methods x tasks x seeds. A variant with a method of its own takes no other."""
+def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name and settings of each run: variants x methods x tasks x seeds. A variant with a method of its own takes no other."""
 
     def axis(key: str) -> list[Any]:
         if not product.get(key):
@@ -133,27 +146,19 @@ def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, li
     base = {key: product[key] for key in ("preset", "frames") if key in product} | _flat(product.get("settings", {}))
     for variant, changes in (product.get("variants") or {"": {}}).items():
         settings = base | _flat(changes)
-        if dashed := [task for task in product.get("tasks", []) if task.startswith("-")]:
-            raise InputError(f"{where} has the task {dashed[0]!r}, which looks like an option.")
         for key in {"task", "seed", "out", "help"} & settings.keys():
             raise InputError(f"{where} has {key!r} among its settings; there are the lists tasks and seeds, and --out.")
         own = settings.get("reward", settings.get("method"))
         for method, task, seed in itertools.product([own] if own else axis("methods"), axis("tasks"), axis("seeds")):
             arm = variant if own and variant else f"{method}-{variant}" if variant else method
             name = "/".join(re.sub(r"[^\w-]+", "-", part) for part in (envs.task_name(task), arm, str(seed)))
-            options = settings if own else {"method": method} | settings
-            yield name, [task, f"--seed={seed}", *(f"--{key}={value}" for key, value in options.items())]
+            yield name, {"method": method if "reward" not in settings else "pcil", **settings, "task": task, "seed": seed}
 
 
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested tables as dotted names: in TOML a dotted name without quotes is a nested table. An environment's arguments are one
-    value, in JSON."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if prefix + key in ("env_kwargs", "env-kwargs") and isinstance(value, dict):
-            value = json.dumps(value, default=str)
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
+def _flat(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings by the names that fields have: in TOML a dotted name without quotes is a nested table, and a name may have
+    dashes as on the command line."""
+    return renamed({name.replace("-", "_"): value for name, value in files.flat(settings).items()})
 
 
 def _check(where: str, table: dict[str, Any], examples: dict[str, Any]) -> None:

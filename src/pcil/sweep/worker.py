@@ -25,12 +25,12 @@ TOPOLOGY = Path("/sys/devices/system/cpu")
 """Where Linux says which cores are two threads of one."""
 
 
-def train(words: list[str], folder: Path, cores: int) -> int:
-    """Train the run in `folder` that the words of `pcil train` give, on so many cores of its own. Returns the exit code."""
-    print(f"{socket.gethostname()}, process {os.getpid()}: pcil train {shlex.join(words)}", flush=True)
+def train(argv: list[str], folder: Path, cores: int) -> int:
+    """Train the run in `folder` that the arguments of `pcil train` give, on so many cores of its own. Returns the exit code."""
+    print(f"{socket.gethostname()}, process {os.getpid()}: pcil train {shlex.join(argv)}", flush=True)
     _wait_until_free(folder / ".lock")
     held = own_cores(cores)
-    sys.argv = ["pcil", "train", *words]
+    sys.argv = ["pcil", "train", *argv]
     try:
         runpy.run_module("pcil", run_name="__main__")
     except SystemExit as end:
@@ -91,10 +91,10 @@ def _stop_at_end_of_input() -> None:
 
 
 def main() -> int:
-    """The run whose folder, number of cores and words of `pcil train` are this process's arguments."""
+    """The run whose folder, number of cores and arguments of `pcil train` are this process's arguments."""
     threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
-    folder, cores, *words = sys.argv[1:]
-    return train(words, Path(folder), int(cores))
+    folder, cores, *argv = sys.argv[1:]
+    return train(argv, Path(folder), int(cores))
 
 
 if __name__ == "__main__":

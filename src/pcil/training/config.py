@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf
 from typing import Annotated, Any, Literal
 
 import tyro
 
+from pcil import modules
 from pcil.agents import AGENTS, Agent, DrQV2
-from pcil.errors import InputError, check_kinds, check_ranges, json_object
+from pcil.errors import InputError, brief, check_kinds, check_ranges, json_object
+from pcil.files import flat
 from pcil.rewards import PCIL, REWARDS, Reward
 
 MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
@@ -31,7 +34,7 @@ EnvKwargs = Annotated[
 
 
 @dataclass(frozen=True)
-class Method:
+class Algorithm:
     """What learns: all that is static in the compiled step, so runs that differ in seed or frames share one compilation."""
 
     agent: Agent
@@ -84,6 +87,8 @@ class Run:
     """Episodes of an evaluation."""
     checkpoint_seconds: float = 120.0
     """Least time from one checkpoint to the next; a checkpoint is written between episodes, and when the run stops."""
+    num_envs: int = 1
+    """Environments that are played side by side while training, an episode in each."""
     single_environment: bool = False
     """Open one environment at a time and evaluate in it too, one episode after the other: slower, with the same results."""
 
@@ -104,7 +109,16 @@ class Run:
                 f"The reward's batch of {self.reward.batch_size} agent steps is taken from the agent's batch, which has "
                 f"{self.agent.batch_size}; make reward.batch_size at most agent.batch_size."
             )
-        check_ranges(self, update_every=(1, inf), evaluate_every=(1, inf), evaluate_episodes=(1, inf), replay_steps=(1, inf))
+        if self.single_environment and self.num_envs > 1:
+            raise InputError(f"A single environment can't be {self.num_envs} side by side; leave out one of the two settings.")
+        check_ranges(
+            self,
+            update_every=(1, inf),
+            num_envs=(1, 1000),
+            evaluate_every=(1, inf),
+            evaluate_episodes=(1, inf),
+            replay_steps=(1, inf),
+        )
         check_ranges(
             self,
             frames=(1, inf),
@@ -115,9 +129,14 @@ class Run:
         )
 
     @property
-    def learner(self) -> Method:
+    def learner(self) -> Algorithm:
         """The part of the settings that is compiled."""
-        return Method(self.agent, self.reward, self.label)
+        return Algorithm(self.agent, self.reward, self.label)
+
+    @property
+    def needs_demos(self) -> bool:
+        """Whether demonstrations are used at all."""
+        return self.reward.needs_demos or self.agent.offline
 
     @property
     def needs_actions(self) -> bool:
@@ -130,16 +149,6 @@ class Run:
         reward counts."""
         return self.reward.task_weight != 0 and (self.agent.offline or self.reward.prefill[0] > 0)
 
-    @property
-    def plain(self) -> Run:
-        """This run with every setting at its class's default: what an older `run.json`, written before a setting was there,
-        says of it. So a new setting's default must be what the code did without it."""
-        kept = {
-            name: getattr(self, name) for name in ("task", "label")
-        }  # older than every run; not each reward takes each label
-        agent = dataclasses.replace(_plain(self.agent), absorbing=False)  # None is decided before `run.json` is written
-        return _plain(self, **kept, agent=agent, reward=_plain(self.reward))
-
     def to_json(self) -> dict[str, Any]:
         """Every setting, nested, as JSON gives it back; agent and reward say their class, ours by its name in the registry."""
         tree = dataclasses.asdict(self)
@@ -147,6 +156,46 @@ class Run:
             kind = type(getattr(self, name))
             tree[name] = {"class": registered(name, f"{kind.__module__}:{kind.__qualname__}"), **tree[name]}
         return json.loads(json.dumps(tree))
+
+    @classmethod
+    def from_json(cls, settings: dict[str, Any], classes: Mapping[str, type] | None = None) -> Run:
+        """The run that `to_json` gave, of an older version too; `settings` may be nested or `pcil.files:flat`.
+
+        A setting that an older file lacks is its class's default, so a new setting's default must be what the code did without
+        it. Only our own agents and rewards are made, and those of `classes`, by their paths; `InputError` names another one.
+        """
+        values = renamed(flat(settings))
+        kinds: dict[str, Any] = {}
+        for part, known in REGISTRIES.items():
+            name = values.pop(f"{part}.class")
+            if name not in {**known, **(classes or {})}:
+                raise InputError(f"The {part} {brief(name)} is none of ours, and what a file names is not run unasked.")
+            kinds[part] = {**known, **(classes or {})}[name]
+        own = {field.name for field in dataclasses.fields(cls)}
+        plain = {name: values.pop(name) for name in list(values) if name in own}
+        parts = {
+            part: _made(kind, {"absorbing": False} if part == "agent" else {}, part, values) for part, kind in kinds.items()
+        }
+        return changed(cls(**plain, **parts), values)
+
+
+def _made(kind: type, first: dict[str, Any], part: str, values: dict[str, Any]) -> Any:
+    """A part of a run at its class's defaults, with what it can't be made without from the values."""
+    needed = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory is dataclasses.MISSING]
+    return kind(**first, **{name: values[f"{part}.{name}"] for name in needed if f"{part}.{name}" in values})
+
+
+RENAMED = {"agent.standardise": "agent.normalize_observations"}
+"""Settings by the names that they had in older versions."""
+
+
+def renamed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Flat settings of an older version, by the names that settings and classes have today."""
+    values = {}
+    for name, value in settings.items():
+        part, _, rest = name.partition(".")
+        values[RENAMED.get(name, name)] = registered(part, value) if rest == "class" and part in REGISTRIES else value
+    return values
 
 
 def registered(part: str, path: str) -> str:
@@ -157,10 +206,12 @@ def registered(part: str, path: str) -> str:
     return own.get(name, path) if module.startswith("pcil.") else path
 
 
-def renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a `run.json`, of an older version too, with the classes by the names that they have today."""
-    parts = {part: {**settings[part], "class": registered(part, settings[part]["class"])} for part in REGISTRIES}
-    return {**settings, **parts}
+def part_of_run(part: str, spec: str) -> Any:
+    """The class of agents or rewards that a name of the registry or `my.module:MyClass` stands for; the module is imported."""
+    if spec in REGISTRIES[part]:
+        return REGISTRIES[part][spec]
+    base = {"agent": Agent, "reward": Reward}[part]
+    return modules.load(f"--{part}", spec, base, f"one of {', '.join(REGISTRIES[part])}, or my.module:My{base.__name__}")
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:
@@ -181,20 +232,6 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
             own[name] = value
     own |= {name: changed(own.get(name, getattr(settings, name)), inner) for name, inner in nested.items()}
     return dataclasses.replace(settings, **own)
-
-
-def _plain(settings: Any, **kept: Any) -> Any:
-    """Settings at their class's defaults, where it has some, but for those that are `kept`."""
-    fields = dataclasses.fields(settings)
-    own = {field.name: field.default for field in fields if field.default is not dataclasses.MISSING}
-    own |= {field.name: field.default_factory() for field in fields if field.default_factory is not dataclasses.MISSING}
-    return dataclasses.replace(settings, **(own | kept))
-
-
-def completed(old: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    """`old` with what it lacks of nested `defaults`."""
-    both = {name: completed(value, defaults[name]) for name, value in old.items() if isinstance(defaults.get(name), dict)}
-    return {**defaults, **old, **both}
 
 
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:

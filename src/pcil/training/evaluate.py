@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from pcil import envs, modules
+from pcil.envs.rollout import Rollout
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
 from pcil.seeds import Stream, episode_seed
@@ -31,11 +32,18 @@ class Evaluation:
     """Agent steps, one number an episode."""
     seconds: float
     """Wall-clock time of all of them."""
+    info: dict[str, np.ndarray] = field(default_factory=dict)
+    """Each number that the environment's `info` held at the end of every episode, one an episode, by name."""
 
     @property
     def mean(self) -> float:
         """Mean return."""
         return float(np.mean(self.returns))
+
+    @property
+    def success(self) -> list[float] | None:
+        """1 where an episode ended in success, 0 elsewhere, where the environment reports `is_success`; else None."""
+        return self.info["is_success"].tolist() if "is_success" in self.info else None
 
 
 def playable(folder: Path, env_kwargs: dict[str, Any] | None, trust: Sequence[str]) -> tuple[Policy, dict[str, Any]]:
@@ -55,12 +63,11 @@ def environments_for(
     episodes: int,
     env_kwargs: dict[str, Any] | None = None,
     *,
-    training: bool = False,
+    training: int = 0,
     single: bool = False,
-) -> Iterator[list[envs.Checked]]:
-    """What `evaluate` plays so many episodes in, closed at the end: one each, but at most `LOCKSTEP`, for each takes memory.
-
-    With `training` there is a further one for training, the first; where it must be `single`, there is one for everything.
+) -> Iterator[tuple[list[envs.Checked], list[envs.Checked]]]:
+    """So many environments for `training`, and those that `evaluate` plays so many episodes in, closed at the end: one each,
+    but at most `LOCKSTEP`, for each takes memory. Where it must be `single`, there is one for everything.
     """
     with contextlib.ExitStack() as stack:
         number = 1 if single else min(episodes, LOCKSTEP) + training
@@ -70,7 +77,7 @@ def environments_for(
                 f"The {envs.task_name(task)} returned the same environment twice; let it make a new one each time, or set "
                 "single_environment."
             )
-        yield made
+        yield (made, made) if single else (made[:training], made[training:])
 
 
 def evaluate(
@@ -91,22 +98,29 @@ def evaluate(
     begin = time.perf_counter()
     checked = [envs.checked(env) for env in environments]
     episodes = len(checked) if episodes is None else episodes
-    returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
+    returns, lengths, infos = np.zeros(episodes), np.zeros(episodes, np.int64), []
     size = max(LOCKSTEP, len(checked))
     for first in range(0, episodes, size):
         block = range(first, min(first + size, episodes))
         for start in range(first, block.stop, len(checked)):
-            playing = dict(zip(range(start, block.stop), checked, strict=False))
-            rows = np.zeros((len(block), envs.spec(checked[0]).obs_dim), np.float32)
-            for i, env in playing.items():
-                env.episode, start_seed = f"evaluation episode {i + 1}", episode_seed(seed, Stream.EVALUATE, i)
-                rows[i - first] = env.reset(seed=start_seed)[0]
-            while playing:
-                for i, action in zip(block, act(rows), strict=True):
-                    if i in playing:
-                        rows[i - first], reward, terminated, truncated, _ = playing[i].step(action)
-                        returns[i] += reward
-                        lengths[i] += 1
-                        if terminated or truncated:
-                            del playing[i]
-    return Evaluation(returns, lengths, time.perf_counter() - begin)
+            numbers = range(start, min(start + len(checked), block.stop))
+            rows, part = np.zeros((len(block), envs.spec(checked[0]).obs_dim), np.float32), slice(start - first, None)
+            starts = [episode_seed(seed, Stream.EVALUATE, i) for i in numbers]
+            names = [f"evaluation episode {i + 1}" for i in numbers]
+            rollout = Rollout(checked[: len(numbers)], starts, names, keep=False)
+            while rollout.playing:
+                rows[part][: len(numbers)] = rollout.obs
+                if len(actions := act(rows)) != len(rows):
+                    raise ValueError(f"{len(actions)} actions for {len(rows)} observations")
+                rollout.step(actions[part])
+            returns[start : numbers.stop], lengths[start : numbers.stop] = rollout.returns, rollout.lengths
+            infos += rollout.info
+    return Evaluation(returns, lengths, time.perf_counter() - begin, _reduced(infos))
+
+
+def _reduced(infos: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """The numbers that all of these have, by name."""
+    names = [name for name in infos[0] if isinstance(name, str)]
+    columns = {name: [np.asarray(info.get(name)) for info in infos] for name in names}
+    fine = {name: all(x.size == 1 and x.dtype.kind in "fiub" for x in column) for name, column in columns.items()}
+    return {name: np.array([float(x.item()) for x in column]) for name, column in columns.items() if fine[name]}

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil import seeds
 from pcil.nets.networks import Actor, Trunk
-from pcil.rewards import Reward, label, states_read
+from pcil.rewards import Reward, label
 from pcil.seeds import Stream
-from pcil.training.config import Method
+from pcil.training.config import Algorithm
 from pcil.types import Batch, Episode, Spec, Window
 
 UNSAID = {"features": "the agent's parameters", "rewards": "the rewards of the batch", "actor": "the actor's parameters"}
@@ -37,19 +37,21 @@ class Learner(eqx.Module):
     each of `checks(totals)` was first not finite."""
 
 
-@functools.partial(jax.jit, static_argnames=("method", "spec"))
-def init(method: Method, spec: Spec, demos: Sequence[Batch], seed: int | Array) -> Learner:
+@functools.partial(jax.jit, static_argnames=("algorithm", "spec"))
+def init(algorithm: Algorithm, spec: Spec, demos: Sequence[Batch], seed: int | Array) -> Learner:
     """The state before the first update; `demos` may be empty where nothing needs them."""
     root = jax.random.key_data(jax.random.key(seed))
     key = jax.random.wrap_key_data(root)
-    agent = method.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
+    agent = algorithm.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
     if demos:
-        agent = method.agent.observe(agent, jnp.concatenate([demo.obs for demo in demos]))
-    reward = method.reward.init(demos, frozen_embed(method, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
+        agent = algorithm.agent.observe(agent, jnp.concatenate([demo.obs for demo in demos]))
+    reward = algorithm.reward.init(demos, frozen_embed(algorithm, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
-    window = _zeros(spec, method.agent.batch_size, max(method.agent.n_step, method.reward.span))
-    expert = _zeros(spec, method.reward.batch_size, method.reward.span)
-    metrics = jax.eval_shape(functools.partial(_step, method), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
+    window = _zeros(spec, algorithm.agent.batch_size, max(algorithm.agent.n_step, algorithm.reward.span))
+    expert = _zeros(spec, algorithm.reward.batch_size, algorithm.reward.span)
+    metrics = jax.eval_shape(functools.partial(_step, algorithm), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[
+        1
+    ]
     zeros = {name: jnp.zeros(()) for name in [*sorted(metrics.keys() - set(UNSAID)), "updates"]}
     return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(checks(metrics)))})
 
@@ -61,23 +63,29 @@ def _zeros(spec: Spec, rows: int, n: int) -> Window:
     return Window(obs, action, reward, discount, jnp.zeros(rows, jnp.int32))
 
 
-def frozen_embed(method: Method, agent: Any) -> Trunk:
+def frozen_embed(algorithm: Algorithm, agent: Any) -> Trunk:
     """The agent's features of an observation, through which no gradient flows."""
-    return jax.lax.stop_gradient(method.agent.trunk(agent, method.reward.features))
+    return jax.lax.stop_gradient(algorithm.agent.trunk(agent, algorithm.reward.trunk))
 
 
-@functools.partial(jax.jit, static_argnames="method", donate_argnames="learner")
+@functools.partial(jax.jit, static_argnames="algorithm", donate_argnames="learner")
 def update(
-    method: Method, learner: Learner, window: Window, expert: Window | None, seen: Window | None, step: Array, count: Array
+    algorithm: Algorithm,
+    learner: Learner,
+    window: Window,
+    expert: Window | None,
+    longer: Window | None,
+    step: Array,
+    count: Array,
 ) -> tuple[Learner, Actor]:
     """One update of the reward, then of the agent; `step` counts agent steps and `count` updates, both from 0.
 
-    The reward learns from windows of the `expert` and from those that are `seen` of the agent: without them, from the first
-    rows of `window`, as in the authors' code. `expert` is None where no demonstrations are
-    drawn. The second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
+    The reward learns from windows of the `expert`, None where no demonstrations are drawn, and from windows of the agent: from
+    those that are `longer` than `window`, if it needs such, else from the first rows of `window`, as in the authors' code. The
+    second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
-    learner, metrics = _step(method, learner, window, expert, seen, step, count)
-    actor, before = method.agent.actor(learner.agent), learner.totals
+    learner, metrics = _step(algorithm, learner, window, expert, longer, step, count)
+    actor, before = algorithm.agent.actor(learner.agent), learner.totals
     metrics["actor"] = _largest(actor)
     good = jnp.stack([jnp.isfinite(metrics[name]) for name in checks(metrics)])
     totals = {name: before[name] + value for name, value in {**metrics, "updates": 1.0}.items() if name not in UNSAID}
@@ -87,30 +95,37 @@ def update(
 
 
 def _step(
-    method: Method,
+    algorithm: Algorithm,
     learner: Learner,
     window: Window,
     expert: Window | None,
-    seen: Window | None,
+    longer: Window | None,
     step: Array,
     count: Array,
 ) -> tuple[Learner, dict[str, Array]]:
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
-    agent = method.agent.observe(learner.agent, window.obs[:, 0])
-    embed = frozen_embed(method, agent)
-    seen = seen or Window(*(array[: method.reward.batch_size] for array in window))
-    expert = expert or Window(*(array[:0] for array in window))
-    reward_state, reward_metrics = method.reward.update(learner.reward, expert, seen, embed, key=reward_key)
-    if method.label == "sampled":
-        fresh = label(method.reward, reward_state, window.obs, window.action, window.reward, embed, key=label_key)
+    agent = algorithm.agent.observe(learner.agent, window.obs[:, 0])
+    embed = frozen_embed(algorithm, agent)
+    both = (
+        steps(expert or Window(*(array[:0] for array in window))),
+        steps(longer or Window(*(array[: algorithm.reward.batch_size] for array in window))),
+    )
+    reward_state, reward_metrics = algorithm.reward.update(learner.reward, *both, embed, key=reward_key)
+    if algorithm.label == "sampled":
+        fresh = label(algorithm.reward, reward_state, steps(window), window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
-    unsaid = {"features": frozen_embed(method, learner.agent), "rewards": window.reward}
-    agent_state, agent_metrics = method.agent.update(agent, window, step=step, key=agent_key)
+    unsaid = {"features": frozen_embed(algorithm, learner.agent), "rewards": window.reward}
+    agent_state, agent_metrics = algorithm.agent.update(agent, window, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
     metrics |= {name: _largest(tree) for name, tree in unsaid.items()}
     return Learner(agent_state, reward_state, learner.root, learner.totals), metrics
+
+
+def steps(window: Window) -> Batch:
+    """The steps of windows, as rewards are given them."""
+    return Batch.of(*map(jnp.asarray, (window.obs, window.action, window.discount, window.episode_id)))
 
 
 def _largest(tree: Any) -> Float[Array, ""]:
@@ -157,41 +172,41 @@ def copied(learner: Learner) -> Learner:
     return jax.tree.map(jnp.copy, learner)
 
 
-def close_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Learner:
+def close_episode(algorithm: Algorithm, learner: Learner, episode: Episode, count: int) -> Learner:
     """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
-    if type(method.reward).after_episode is Reward.after_episode:
+    if type(algorithm.reward).after_episode is Reward.after_episode:
         return learner
-    reward = _after_rows(method, learner, *_padded(method, episode)[:2], np.int32(count))
+    reward = _after_rows(algorithm, learner, *_padded(algorithm, episode)[:2], np.int32(count))
     return Learner(learner.agent, reward, learner.root, learner.totals)
 
 
-@functools.partial(jax.jit, static_argnames="method")
-def _after_rows(method: Method, learner: Learner, obs: Array, action: Array, count: Array) -> Any:
-    obs, key = states_read(method.reward, obs), _label_key(learner, count)
-    return method.reward.after_episode(learner.reward, obs, action, frozen_embed(method, learner.agent), key=key)
+@functools.partial(jax.jit, static_argnames="algorithm")
+def _after_rows(algorithm: Algorithm, learner: Learner, obs: Array, action: Array, count: Array) -> Any:
+    embed, key = frozen_embed(algorithm, learner.agent), _label_key(learner, count)
+    return algorithm.reward.after_episode(learner.reward, Batch.of(obs, action), embed, key=key)
 
 
-def label_episode(method: Method, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
+def label_episode(algorithm: Algorithm, learner: Learner, episode: Episode, count: int) -> Float[np.ndarray, " T"]:
     """The reward of each step of one whole episode."""
-    return np.asarray(_label_rows(method, learner, *_padded(method, episode), np.int32(count)))[: len(episode)]
+    return np.asarray(_label_rows(algorithm, learner, *_padded(algorithm, episode), np.int32(count)))[: len(episode)]
 
 
-def _padded(method: Method, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _padded(algorithm: Algorithm, episode: Episode) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Observations, actions and true rewards of an episode, so that episodes of many lengths share a few compilations.
 
     A reward for which rows behind the end make no difference gets a multiple of `LABEL_ROWS` rows, with NaN for the actions
     that are not there; another one gets exactly the episode.
     """
-    spare = -len(episode) % LABEL_ROWS if method.reward.scope == "step" or method.reward.takes_padding else 0
+    spare = -len(episode) % LABEL_ROWS if algorithm.reward.scope == "step" or algorithm.reward.takes_padding else 0
     obs = np.pad(episode.obs, ((0, spare), (0, 0)), mode="edge")
     action = np.pad(episode.action, ((0, spare), (0, 0)), constant_values=np.nan)
     return obs, action, np.pad(episode.reward.astype(np.float32), (0, spare))
 
 
-@functools.partial(jax.jit, static_argnames="method")
-def _label_rows(method: Method, learner: Learner, obs: Array, action: Array, task_reward: Array, count: Array) -> Array:
-    embed, key = frozen_embed(method, learner.agent), _label_key(learner, count)
-    return label(method.reward, learner.reward, obs, action, task_reward, embed, key=key)
+@functools.partial(jax.jit, static_argnames="algorithm")
+def _label_rows(algorithm: Algorithm, learner: Learner, obs: Array, action: Array, task_reward: Array, count: Array) -> Array:
+    embed, key = frozen_embed(algorithm, learner.agent), _label_key(learner, count)
+    return label(algorithm.reward, learner.reward, Batch.of(obs, action), task_reward, embed, key=key)
 
 
 def _label_key(learner: Learner, count: Array) -> PRNGKeyArray:

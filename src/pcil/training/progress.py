@@ -10,14 +10,17 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from pcil.errors import shown
+from pcil.training.callbacks import Callback, History
 from pcil.training.config import Run
 from pcil.training.evaluate import Evaluation
 
@@ -91,13 +94,14 @@ class Signals:
         self._answer()
 
 
-class Bar:
+class Bar(Callback):
     """Reports a run to the terminal. Ctrl-C or SIGTERM ends it after the episode at hand; a second Ctrl-C at once."""
 
-    def __init__(self, console: Console, expert_return: float | None) -> None:
+    def __init__(self, console: Console, expert_return: float | None = None) -> None:
+        """`expert_return` is what returns are compared with, unless the run has demonstrations."""
         self._signals = Signals(self._stopping)
         self.evaluations: list[tuple[int, float]] = []
-        self._expert = expert_return
+        self.expert_return = expert_return
         self._began: tuple[float, int] | None = None
         self._progress = Progress(
             TextColumn("{task.description}", markup=False),
@@ -125,24 +129,33 @@ class Bar:
         """The one that has asked to stop."""
         return self._signals.number
 
-    def episode(self, run: Run, frames: int, total_reward: float) -> None:
+    def begin(self, run: Run, folder: Path, history: History) -> None:
+        self._run = run
+        if history.demos_return is not None:
+            self.expert_return = history.demos_return
+
+    def episode(self, row: dict[str, Any]) -> None:
         """Advance the bar; the speed is measured from the first episode of this session, compilation left out."""
+        if "return" not in row:  # of an offline agent, which plays none
+            return
+        frames = row["frames"]
         now = time.perf_counter()
         self._began = self._began or (now, frames)
         seconds = now - self._began[0]
         rate = (frames - self._began[1]) / seconds if seconds > 0 else 0.0
-        amount = f"{frames:,}/{run.frames:,} frames  {rate:,.0f}/s"
-        self._update(run, frames, rate=rate, amount=amount, returns=self._returns(total_reward))
+        amount = f"{frames:,}/{self._run.frames:,} frames  {rate:,.0f}/s"
+        self._update(frames, rate=rate, amount=amount, returns=self._returns(row["return"]))
 
-    def evaluation(self, run: Run, frames: int, result: Evaluation) -> None:
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
         """One line for each evaluation, beside the expert's return."""
         self.evaluations.append((frames, result.mean))
-        against = f" ({compared(result.mean, self._expert)})" if self._expert is not None else ""
+        against = f" ({compared(result.mean, self.expert_return)})" if self.expert_return is not None else ""
+        against += f"  success {np.mean(result.success):.0%}" if result.success else ""
         low, high = result.returns.min(), result.returns.max()
-        self.say(f"{frames:>9,} frames  return {result.mean:7.1f}  [{low:.1f}, {high:.1f}]{against}")
-        self._update(run, frames)
+        self.message(f"{frames:>9,} frames  return {result.mean:7.1f}  [{low:.1f}, {high:.1f}]{against}")
+        self._update(frames)
 
-    def say(self, text: str) -> None:
+    def message(self, text: str) -> None:
         """Print above the bar."""
         self._progress.console.print(shown(text), highlight=False, markup=False, soft_wrap=True)
 
@@ -150,13 +163,13 @@ class Bar:
         """Whether a signal has asked to stop."""
         return self.signal is not None
 
-    def _update(self, run: Run, frames: int, **fields: Any) -> None:
-        name = shown(f"{run.task} {run.method}", 60)
-        self._progress.update(self._task, description=name, completed=frames, total=run.frames, **fields)
+    def _update(self, frames: int, **fields: Any) -> None:
+        name = shown(f"{self._run.task} {self._run.method}", 60)
+        self._progress.update(self._task, description=name, completed=frames, total=self._run.frames, **fields)
 
     def _returns(self, total_reward: float) -> str:
         last = f"return {total_reward:.0f}"
-        return f"{last} of {self._expert:.0f}" if self._expert is not None else last
+        return f"{last} of {self.expert_return:.0f}" if self.expert_return is not None else last
 
     def _stopping(self) -> None:
-        self.say("Stopping after this episode; Ctrl-C again stops at once and loses what came since the last checkpoint.")
+        self.message("Stopping after this episode; Ctrl-C again stops at once and loses what came since the last checkpoint.")

@@ -22,7 +22,7 @@ class Segment(NamedTuple):
     start: int
     length: int
     terminated: bool
-    number: int
+    episode_id: int
     """Episodes added before it, those that have left included."""
 
     def starts(self, n: int) -> int:
@@ -102,7 +102,7 @@ class Replay:
             raise InputError(f"The replay holds no window of {n} steps: every episode in it is shorter.")
         draw = rng.integers(total, size=batch)
         which = np.searchsorted(cumulative, draw, side="right")
-        start, length, terminated, number, before = table[which].T
+        start, length, terminated, episode_id, before = table[which].T
         offset = (draw - before)[:, None] + np.arange(n + 1)
         row = (start[:, None] + np.minimum(offset, length[:, None])) % self.capacity
         inside = offset[:, :-1] < length[:, None]
@@ -112,7 +112,7 @@ class Replay:
             self._action[row[:, :-1]],
             self._reward[row[:, :-1]],
             alive.astype(np.float32),
-            number.astype(np.int32),
+            episode_id.astype(np.int32),
         )
 
     def state(self) -> dict[str, np.ndarray]:
@@ -142,7 +142,7 @@ class Replay:
         return self.capacity - sum(segment.length + 1 for segment in self._segments)
 
     def _starts(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """A row `(start, length, terminated, number, valid starts before)` an episode, and the total of valid starts."""
+        """A row `(start, length, terminated, episode_id, valid starts before)` an episode, and the total of valid starts."""
         if n not in self._index:
             counts = np.array([segment.starts(n) for segment in self._segments], np.int64)
             cumulative = np.cumsum(counts)

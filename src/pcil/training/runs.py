@@ -9,7 +9,7 @@ import platform
 import signal
 import subprocess
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,11 +20,11 @@ import gymnasium
 from pcil import compilation, envs, files
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError, brief
+from pcil.files import flat
 from pcil.policy import Policy, load_policy
 from pcil.training import fit, loop, presets, progress, state
-from pcil.training.config import Run, changed, completed, differences, renamed
-from pcil.training.evaluate import Evaluation
-from pcil.training.metrics import LOGS
+from pcil.training.callbacks import LOGS, Callback, Callbacks
+from pcil.training.config import Run, changed, differences, renamed
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
@@ -45,22 +45,6 @@ class Result:
         return load_policy(self.folder)
 
 
-class Silent:
-    """A reporter that tells nobody and never stops."""
-
-    def episode(self, run: Run, frames: int, total_reward: float) -> None:
-        del run, frames, total_reward
-
-    def evaluation(self, run: Run, frames: int, result: Evaluation) -> None:
-        del run, frames, result
-
-    def say(self, text: str) -> None:
-        del text
-
-    def stop(self) -> bool:
-        return False
-
-
 def train(
     task: Any,
     *,
@@ -68,17 +52,17 @@ def train(
     method: Any = "pcil",
     preset: Any = "default",
     demos: Any = None,
-    reporter: loop.Reporter | None = None,
+    callbacks: Sequence[Callback] = (),
     **changes: Any,
 ) -> Result:
     """Train a policy in the folder `out`, or resume or report what is there.
 
     `task` is a task's name, a function that makes a new environment at each call, or an environment, which is then the run's
-    single one and is not closed. `demos` are `Demonstrations`, or the name or path of some. `changes` are fields of `Run`
-    (`seed=1`, `frames=200_000`).
+    single one and is not closed. `demos` are `Demonstrations`, or the name or path of some. `callbacks` are told how the run
+    goes, and may stop it. `changes` are fields of `Run` (`seed=1`, `frames=200_000`).
 
     Raises `InputError` where something given is wrong, `RunError` where the environment fails or training diverges, and
-    `loop.Stopped` where the reporter asks to stop. The first Ctrl-C ends the run after the episode at hand and saves it before
+    `loop.Stopped` where a callback asks to stop. The first Ctrl-C ends the run after the episode at hand and saves it before
     `KeyboardInterrupt` is raised; a second one raises it at once.
     """
     if not isinstance(out, (str, os.PathLike)):
@@ -94,9 +78,8 @@ def train(
         changes["single_environment"] = True
     run = presets.make(envs.task_name(task), method, preset, **changes)
     with progress.Signals(lambda: None, signal.SIGINT) as signals:
-        listener = _Interruptible(reporter or Silent(), signals)
         try:
-            result = execute(run, Path(out), listener, task=task, demos=given)
+            result = execute(run, Path(out), [*callbacks, _StopOn(signals)], task=task, demos=given)
         except loop.Stopped:
             if signals.number is None:
                 raise
@@ -106,37 +89,38 @@ def train(
     return result
 
 
-class _Interruptible:
-    """A reporter that also asks to stop where a signal did."""
+class _StopOn(Callback):
+    """Asks to stop where a signal did."""
 
-    def __init__(self, reporter: loop.Reporter, signals: progress.Signals) -> None:
-        self.episode, self.evaluation, self.say = reporter.episode, reporter.evaluation, reporter.say
-        self._stop, self._signals = reporter.stop, signals
+    def __init__(self, signals: progress.Signals) -> None:
+        self._signals = signals
 
     def stop(self) -> bool:
-        return self._stop() or self._signals.number is not None
+        return self._signals.number is not None
 
 
 def execute(
-    run: Run, folder: Path, reporter: loop.Reporter, *, task: Any = None, demos: Demonstrations | None = None
+    run: Run, folder: Path, callbacks: Sequence[Callback] = (), *, task: Any = None, demos: Demonstrations | None = None
 ) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference.
 
     `task` and `demos` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
     """
     compilation.use_cache()
-    folder = files.expanded(folder)
-    run, demos, why = prepared(run, reporter.say, task=task, given=demos)
+    folder, say = files.expanded(folder), Callbacks(callbacks).message
+    run, demos, why = prepared(run, say, task=task, given=demos)
     with _claimed(folder), files.room_for(f"The run in {folder}"), _withdrawn_if_refused(folder):
-        _describe(folder, run, demos, reporter)
+        _describe(folder, run, demos, say)
         if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder))):
-            reporter.say(why_not)
+            say(why_not)
             (folder / "DONE").unlink()
         if not (folder / "DONE").exists():
-            reporter.say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
+            say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
             (folder / "error.txt").unlink(missing_ok=True)
             with _traceback_kept(folder / "error.txt"):
-                final = loop.train_loop(run, folder, demos.episodes if demos else (), reporter, task).counters.final_return
+                episodes, paid = (demos.episodes, demos.return_mean) if demos else ((), None)
+                ended = loop.train_loop(run, folder, episodes, callbacks, task=task, demos_return=paid)
+                final = ended.counters.final_return
             files.write_text(folder / "DONE", json.dumps({"final_return": final}) + "\n")
         return Result(folder, read_done(folder), demos.return_mean if demos else None)
 
@@ -193,7 +177,7 @@ def _fitted(
         raise InputError(
             f"The replay has {run.replay_steps} rows, and an episode of {run.task} may take {limit + 1}; enlarge it."
         )
-    if not run.reward.needs_demos and not run.agent.offline:
+    if not run.needs_demos:
         return None
     source = run.task if run.demos is None else run.demos
     loaded = given or Demonstrations.load(source, bounded=False)
@@ -241,9 +225,16 @@ def _claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def check(run: Run, folder: Path) -> None:
-    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
-    run, demos, _ = prepared(run)
+def check(run: Run, folder: Path, loaded: dict[str, Demonstrations] | None = None) -> None:
+    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there.
+
+    `loaded` has demonstrations that were read before, by what names them, and gets those that are read here.
+    """
+    source = run.task if run.demos is None else run.demos
+    loaded = {} if loaded is None else loaded
+    if run.needs_demos and source not in loaded:
+        loaded[source] = Demonstrations.load(source, bounded=False)
+    run, demos, _ = prepared(run, given=loaded.get(source))
     identity = _identity(run, demos)
     if (folder / "run.json").exists():
         _refuse_another(run, folder, identity)
@@ -255,7 +246,7 @@ def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
     return {"run": run.to_json(), "demos": about}
 
 
-def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: loop.Reporter) -> None:
+def _describe(folder: Path, run: Run, demos: Demonstrations | None, say: Callable[[str], None]) -> None:
     """Write `run.json`, or check that the one which is there describes this very run."""
     identity = _identity(run, demos)
     versions = {"python": platform.python_version()}
@@ -269,14 +260,14 @@ def _describe(folder: Path, run: Run, demos: Demonstrations | None, reporter: lo
     before = _refuse_another(run, folder, identity)
     updated = differences(before.get("versions", {}), versions)
     if updated and not (folder / "DONE").exists():
-        reporter.say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
+        say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
 
 
 def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
     """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
     try:
         before = files.read_json(folder / "run.json")
-        found = differences(completed(renamed(before["run"]), run.plain.to_json()), identity["run"])
+        found = differences(_completed(before["run"], run), flat(identity["run"]))
         found += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
@@ -285,6 +276,15 @@ def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[st
     if found:
         raise InputError(f"The folder {folder} holds another run: {'; '.join(found)}; use its settings or another --out.")
     return before
+
+
+def _completed(settings: dict[str, Any], run: Run) -> dict[str, Any]:
+    """The flat settings of a `run.json`, with those that it lacks; as they are where they make no run like this one."""
+    classes = {f"{type(part).__module__}:{type(part).__qualname__}": type(part) for part in (run.agent, run.reward)}
+    try:
+        return flat(Run.from_json(settings, classes).to_json())
+    except InputError:
+        return renamed(flat(settings))
 
 
 def commit() -> str | None:

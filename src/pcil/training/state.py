@@ -2,25 +2,53 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pcil.errors import InputError
+from pcil import envs
+from pcil.errors import InputError, RunError
 from pcil.nets.networks import Actor
-from pcil.policy import as_saved, load_policy
-from pcil.rewards import states_read
+from pcil.policy import Policy, as_saved, load_policy
 from pcil.training import checkpoint, learner
+from pcil.training.callbacks import LOGS, Callback, LogFiles
 from pcil.training.config import Run
-from pcil.training.learner import Learner
-from pcil.training.metrics import LOGS, Clock
+from pcil.training.learner import Learner, on_host
 from pcil.training.replay import Replay
 from pcil.types import Batch, Episode, Spec
+
+WALL_CLOCK = ("seconds", "frames_per_second")
+"""Columns of the logs that differ between two runs of the same settings; all others are equal."""
+
+
+class Clock:
+    """Wall-clock seconds, going on from where an earlier session stopped."""
+
+    def __init__(self, before: float) -> None:
+        self._before, self._begin = before, time.perf_counter()
+        self._last: tuple[int, float] | None = None
+
+    def total(self) -> float:
+        """Seconds over all sessions."""
+        return self._before + time.perf_counter() - self._begin
+
+    def times(self, frames: int) -> dict[str, float]:
+        """The columns `WALL_CLOCK` of a metrics row."""
+        return {"seconds": round(self.total(), 2), "frames_per_second": round(self.rate(frames), 1)}
+
+    def rate(self, frames: int) -> float:
+        """Frames a second since the last call."""
+        now = self.total()
+        before, self._last = self._last, (frames, now)
+        return (frames - before[0]) / max(now - before[1], 1e-9) if before else 0.0
 
 
 @dataclass(frozen=True)
@@ -51,20 +79,24 @@ class State:
     """The demonstrations; a checkpoint does not hold them."""
     counters: Counters
 
+    def policy(self, obs: np.ndarray) -> np.ndarray:
+        """The actor's mean actions `[k, action]` for observations `[k, obs]`, on the host."""
+        return on_host(self.actor)(obs, np)
+
 
 def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
     """The state before the first step."""
     demos = [absorbed(run, episode) for episode in demos]
     spec = spec._replace(obs_dim=spec.obs_dim + 1) if run.agent.absorbing else spec
-    batches = tuple(Batch(states_read(run.reward, episode.obs), episode.action) for episode in demos)
+    batches = tuple(Batch.of(episode.obs, episode.action) for episode in demos)
     fresh = learner.init(run.learner, spec, batches, run.seed)
     replay = Replay(run.replay_steps, spec.obs_dim, spec.action_dim)
     left, reward = run.reward.prefill
     for episode in itertools.cycle(demos):
         if left <= 0:
             break
-        paid = run.reward.task_weight * episode.reward if run.reward.task_weight else np.zeros(len(episode))
-        replay.add(episode, np.asarray(reward + paid, np.float32))
+        learned = np.full(len(episode), reward)
+        replay.add(episode, np.asarray(run.reward.total(learned, episode.reward), np.float32))
         left -= len(episode)
     actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
@@ -86,16 +118,20 @@ def save(folder: Path, state: State, logs: dict[str, str], clock: Clock) -> None
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, {"counters": asdict(counters), "logs": logs})
 
 
-def resume(run: Run, folder: Path, fresh: State, say: Callable[[str], None]) -> tuple[State, dict[str, str]]:
+def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State, dict[str, str]]:
     """The state of the newest whole checkpoint and what its logs held; `fresh` and no logs where there is none."""
     arrays, meta, complaints = checkpoint.restore(folder / "checkpoint")
     for complaint in complaints:
-        say(complaint)
+        told.message(complaint)
     if arrays is None:
         if any((folder / name).exists() for name in LOGS):
-            say(f"There is no whole checkpoint in {folder}, so the run begins again.")
+            told.message(f"There is no whole checkpoint in {folder}, so the run begins again.")
         return fresh, {}
     arrays = checkpoint.flatten("learner.totals", fresh.learner.totals) | arrays  # all are 0, and older versions have fewer
+    arrays = {name.replace("moments", "opt_state"): array for name, array in arrays.items()}
+    if "learner.reward.reference" in arrays:  # older versions had the states alone
+        ours = checkpoint.flatten("learner.reward.reference", fresh.learner.reward.reference)
+        arrays |= ours | {"learner.reward.reference.next_obs": arrays["learner.reward.reference"]}
     try:
         restored = checkpoint.unflatten("learner", fresh.learner, arrays)
         known = checkpoint.flatten("actor", fresh.actor).keys() <= arrays.keys()  # older ones have no scale of observations
@@ -108,9 +144,69 @@ def resume(run: Run, folder: Path, fresh: State, say: Callable[[str], None]) -> 
     if counters.final_return is None:
         if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
             fresh.replay.load(held)
-        say(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    logs = meta.get("logs") or {name: _beginning(folder / name, length, say) for name, length in meta["positions"].items()}
+        told.message(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
+    logs = meta.get("logs") or {
+        name: _beginning(folder / name, length, told.message) for name, length in meta["positions"].items()
+    }
     return State(restored, actor, fresh.replay, fresh.expert, counters), logs
+
+
+def save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: float) -> None:
+    """Leave the policy of this moment in the run's folder, with where it comes from."""
+    info = {
+        "method": run.method,
+        "preset": run.preset,
+        "seed": run.seed,
+        "frames": state.counters.frames,
+        "return_mean": return_mean,
+        "action_repeat": spec.action_repeat,
+        "env_kwargs": run.env_kwargs,
+    }
+    Policy(on_host(state.actor), envs.task_name(run.task), info).save(folder / "policy")
+
+
+def take_means(state: State) -> dict[str, Any]:
+    """The number of updates until now, and the mean of each metric over those since the last call."""
+    totals = {name: float(value) for name, value in jax.device_get(state.learner.totals).items() if name != "finite"}
+    updates = totals.pop("updates")
+    zeros = jax.tree.map(jnp.zeros_like, state.learner.totals)
+    state.learner = replace(state.learner, totals=zeros)
+    return {"updates": state.counters.updates} | {name: total / updates for name, total in totals.items() if updates}
+
+
+@contextlib.contextmanager
+def saved_on_failure(run: Run, folder: Path, state: State, log: LogFiles, clock: Clock) -> Iterator[Callable[[], None]]:
+    """Where the environment fails or training diverges, a checkpoint of the state as it is now is left, and no later one.
+
+    What it gives raises `RunError` where an update since has left the finite range.
+    """
+    before, rows = replace(state, learner=learner.copied(state.learner)), log.rows()
+
+    def refuse_divergence() -> None:
+        if found := learner.first_not_finite(state.learner):
+            what, updates = found
+            raise RunError(
+                f"The training on {run.task} diverged: {what} became NaN or infinite in update "
+                f"{before.counters.updates + updates + 1:,}, after frame {before.counters.frames:,}; what was learned "
+                "before is kept, and a smaller learning rate may help."
+            )
+
+    try:
+        yield refuse_divergence
+    except InputError:
+        save(folder, before, log.contents(rows), clock)
+        refuse_divergence()  # it came first, where the actor's actions are not finite any more
+        raise
+
+
+@contextlib.contextmanager
+def saved_anyway(folder: Path, state: State, log: LogFiles, clock: Clock) -> Iterator[None]:
+    """Where a callback fails, a checkpoint of the state as it is then is left."""
+    try:
+        yield
+    except RunError:
+        save(folder, state, log.contents(), clock)
+        raise
 
 
 def _beginning(log: Path, length: int, say: Callable[[str], None]) -> str:

@@ -1,0 +1,64 @@
+"""Episodes, in one environment or in several side by side; acting, and what else happens between steps, is the caller's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pcil.envs.checked import Checked
+from pcil.types import Episode
+
+
+class Rollout:
+    """One episode in each of some environments, stepped together until the last has ended.
+
+    rollout = Rollout([env], [seed], ["recorded episode 1"])
+    while rollout.playing:
+        rollout.step([policy(rollout.obs[0])])
+    (episode,) = rollout.episodes()
+    """
+
+    def __init__(
+        self, environments: Sequence[Checked], seeds: Sequence[int], names: Sequence[str], *, keep: bool = True
+    ) -> None:
+        """Reset each environment with its seed; its name is what errors call the episode. `keep` says whether `episodes` is to
+        have its steps."""
+        self._environments = list(environments)
+        self._seeds, first = list(seeds), []
+        for env, seed, name in zip(environments, seeds, names, strict=True):
+            env.episode = name
+            first.append(env.reset(seed=seed)[0])
+        self._steps: list[list[tuple[np.ndarray, Any, float]]] = [[] for _ in first]
+        self._terminated, self._keep = [False] * len(first), keep
+        self.returns, self.lengths = np.zeros(len(first)), np.zeros(len(first), np.int64)
+        """The sum of each episode's rewards until here, and how many steps it has."""
+        self.obs = np.stack(first)
+        """The newest observation of each episode, `[episodes, obs]`; of one that is over, its last."""
+        self.info: list[dict[str, Any]] = [{} for _ in first]
+        """What the environments said beside it."""
+        self.playing = list(range(len(first)))
+        """Which episodes are not over."""
+
+    def step(self, actions: Sequence[Any] | np.ndarray) -> None:
+        """One step of each episode that is not over, with the action in its place; the other actions are ignored."""
+        obs = self.obs.copy()
+        for i in list(self.playing):
+            obs[i], reward, self._terminated[i], truncated, self.info[i] = self._environments[i].step(actions[i])
+            self.returns[i] += reward
+            self.lengths[i] += 1
+            if self._keep:
+                self._steps[i].append((self.obs[i], actions[i], reward))
+            if self._terminated[i] or truncated:
+                self.playing.remove(i)
+        self.obs = obs
+
+    def episodes(self) -> list[Episode]:
+        """The episodes until here."""
+        made = []
+        for i, steps in enumerate(self._steps):
+            obs, action, reward = zip(*steps, strict=True)
+            arrays = np.stack([*obs, self.obs[i]]), np.stack(action), np.array(reward, np.float64)
+            made.append(Episode(*arrays, self._terminated[i], self._seeds[i]))
+        return made

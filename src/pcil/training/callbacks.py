@@ -1,0 +1,229 @@
+"""Who is told how a run goes: the run's own log files, TensorBoard, a progress bar, and a person's own logger."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+import os
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pcil.errors import RunError
+from pcil.training.config import Run
+from pcil.training.evaluate import Evaluation
+
+LOGS = ("eval.csv", "train.jsonl")
+EVAL_COLUMNS = ("frames", "episode", "return", "length", "seconds")
+
+
+class History(NamedTuple):
+    """What a run had logged when it was saved last; a new run has logged nothing."""
+
+    episodes: list[dict[str, Any]]
+    """The rows of `train.jsonl`."""
+    evaluations: list[dict[str, str]]
+    """The rows of `eval.csv`."""
+    seconds: float
+    """Wall-clock time of the run until then."""
+    demos_return: float | None
+    """Mean return of the demonstrations, where there are any with rewards."""
+
+
+class Callback:
+    """Is told how a run goes, and does nothing unless a method is overridden.
+
+    A logger of one's own is a subclass of it: `pcil.train(..., callbacks=[MyLogger()])`, or on the command line
+    `--callbacks my.module:MyLogger`, which is called without arguments. A metrics row is a dict of numbers by name, that of a
+    line of `train.jsonl`, with `frames` first.
+    """
+
+    def begin(self, run: Run, folder: Path, history: History) -> None:
+        """The run begins in its folder, or goes on after what it had logged."""
+
+    def episode(self, row: dict[str, Any]) -> None:
+        """An episode was played, or a pass of an offline agent was made: its metrics row."""
+
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+        """The policy was evaluated after so many frames and seconds."""
+
+    def message(self, text: str) -> None:
+        """A sentence for a person."""
+
+    def stop(self) -> bool:
+        """Whether the run is to end here, saved; asked between episodes."""
+        return False
+
+    def end(self) -> None:
+        """The run ends or stops: close what `begin` opened."""
+
+
+class Callbacks(Callback):
+    """Several callbacks as one, told in their order. What a person's own raises is a `RunError` that names it."""
+
+    def __init__(self, callbacks: Sequence[Callback]) -> None:
+        self._callbacks = list(callbacks)
+
+    def _tell(self, name: str, *arguments: Any) -> list[Any]:
+        return [_call(callback, name, *arguments) for callback in self._callbacks]
+
+    def begin(self, run: Run, folder: Path, history: History) -> None:
+        self._tell("begin", run, folder, history)
+
+    def episode(self, row: dict[str, Any]) -> None:
+        self._tell("episode", row)
+
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+        self._tell("evaluation", frames, seconds, result)
+
+    def message(self, text: str) -> None:
+        self._tell("message", text)
+
+    def stop(self) -> bool:
+        return any(self._tell("stop"))
+
+    def end(self) -> None:
+        self._tell("end")
+
+
+def _call(callback: Callback, name: str, *arguments: Any) -> Any:
+    try:
+        return getattr(callback, name)(*arguments)
+    except Exception as error:
+        kind = type(callback)
+        if kind.__module__.startswith("pcil."):
+            raise
+        raise RunError(
+            f"The callback {kind.__module__}.{kind.__qualname__} raised {type(error).__name__} ({error}) in {name}."
+        ) from error
+
+
+class LogFiles(Callback):
+    """`eval.csv` and `train.jsonl`; a row is with the system when the call returns.
+
+    It is a part of the run: a checkpoint holds what the files hold, and a run that goes on makes them hold just that. One that
+    begins otherwise is written again, and a person is told.
+    """
+
+    def __init__(self, folder: Path, saved: dict[str, str], tell: Callback) -> None:
+        """`saved` is what each file held at the checkpoint."""
+        self._written = {name: [saved[name]] if name in saved else [] for name in LOGS}
+        self._files = {name: _rewound(folder / name, saved.get(name), tell) for name in LOGS}
+        if not self._written["eval.csv"]:
+            self._write("eval.csv", ",".join(EVAL_COLUMNS) + "\n")
+
+    def rows(self) -> dict[str, int]:
+        """How many texts were written to each file, for `contents`."""
+        return {name: len(texts) for name, texts in self._written.items()}
+
+    def contents(self, rows: dict[str, int] | None = None) -> dict[str, str]:
+        """What each file holds, or held after so many texts, for a checkpoint."""
+        rows = rows or self.rows()
+        return {name: "".join(texts[: rows[name]]) for name, texts in self._written.items()}
+
+    def history(self, seconds: float, demos_return: float | None) -> History:
+        """What other callbacks are to know of it."""
+        held = self.contents()
+        rows = [json.loads(line) for line in held["train.jsonl"].splitlines()]
+        return History(rows, list(csv.DictReader(io.StringIO(held["eval.csv"]))), seconds, demos_return)
+
+    def episode(self, row: dict[str, Any]) -> None:
+        self._write("train.jsonl", json.dumps(row) + "\n")
+
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+        """A row an episode; where the environment reports `is_success` from the first evaluation on, it is the last column."""
+        held = self._written["eval.csv"]
+        if result.success and len(held) == 1 and held[0].count("\n") == 1:
+            self._files["eval.csv"].seek(0)
+            held.clear()
+            self._write("eval.csv", ",".join([*EVAL_COLUMNS, "success"]) + "\n")
+        columns = [range(len(result.returns)), map(repr, result.returns.tolist()), result.lengths.tolist()]
+        columns += [[f"{seconds:.1f}"] * len(result.returns)]
+        if held[0].partition("\n")[0].endswith(",success"):
+            columns.append([f"{value:g}" for value in result.success or [float("nan")] * len(result.returns)])
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows((frames, *row) for row in zip(*columns, strict=True))
+        self._write("eval.csv", text.getvalue())
+
+    def end(self) -> None:
+        for file in self._files.values():
+            file.close()
+
+    def _write(self, name: str, text: str) -> None:
+        _write(self._files[name], text)
+        self._written[name].append(text)
+
+
+class TensorBoard(Callback):
+    """TensorBoard's file of a run, made again from the logs when the run goes on.
+
+    It is written in this thread, so that a full disk is an error here and not one of another thread.
+    """
+
+    def begin(self, run: Run, folder: Path, history: History) -> None:
+        from tensorboardX.record_writer import RecordWriter
+
+        place = folder / "tensorboard"
+        place.mkdir(exist_ok=True)
+        for path in place.glob("events.out.tfevents.*"):
+            path.unlink()
+        self._began = time.time() - history.seconds
+        self._writer = RecordWriter(str(place / f"events.out.tfevents.{int(self._began)}.pcil"))
+        self._event(0.0, file_version="brain.Event:2")
+        for row in history.episodes:
+            self.episode(row)
+        for frames, group in itertools.groupby(history.evaluations, key=lambda row: row["frames"]):
+            episodes = list(group)
+            for tag, column in (("return", "return"), ("success", "success")):
+                if column in episodes[0]:
+                    mean = statistics.fmean(float(row[column]) for row in episodes)
+                    self._scalar(f"evaluation/{tag}", mean, int(frames), float(episodes[0]["seconds"]))
+        self._writer.flush()
+
+    def episode(self, row: dict[str, Any]) -> None:
+        for name, value in row.items():
+            if isinstance(value, float) and math.isfinite(value):
+                self._scalar(name if "/" in name else f"episode/{name}", value, row["frames"], row.get("seconds", 0.0))
+
+    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+        seconds = float(f"{seconds:.1f}")  # as the logs have it
+        self._scalar("evaluation/return", statistics.fmean(result.returns.tolist()), frames, seconds)
+        if result.success:
+            self._scalar("evaluation/success", statistics.fmean(result.success), frames, seconds)
+        self._writer.flush()
+
+    def end(self) -> None:
+        self._writer.close()
+
+    def _scalar(self, name: str, value: float, frames: int, seconds: float) -> None:
+        from tensorboardX.summary import scalar
+
+        self._event(seconds, step=frames, summary=scalar(name, value))
+
+    def _event(self, seconds: float, **content: Any) -> None:
+        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - protobuf makes it
+
+        self._writer.write(Event(wall_time=self._began + seconds, **content).SerializeToString())
+
+
+def _rewound(path: Path, log: str | None, tell: Callback) -> io.FileIO:
+    """The file, at the end of what it held at the checkpoint; written again, and said, where it does not begin with that."""
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    file, content = io.FileIO(os.open(path, flags, 0o666), "r+"), (log or "").encode()
+    if file.read(len(content)) != content:
+        tell.message(f"{path} is not what this run had written; it is written again from the checkpoint.")
+        file.seek(0)
+        _write(file, log or "")
+    file.truncate(len(content))
+    return file
+
+
+def _write(file: io.FileIO, text: str) -> None:
+    left = memoryview(text.encode())
+    while left:  # a disk that gets full takes a part first
+        left = left[file.write(left) :]

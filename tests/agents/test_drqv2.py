@@ -16,7 +16,7 @@ from pcil import envs
 from pcil.agents import DrQV2
 from pcil.envs.toy import PointMass
 from pcil.seeds import Stream, episode_seed
-from pcil.training import loop, runs
+from pcil.training import learner, loop, runs
 from pcil.types import Spec, Window
 from small import narrow, random_batch, small_run
 
@@ -91,7 +91,7 @@ def test_update_noise_is_clipped_and_acting_noise_is_not() -> None:
     one, _ = wild.update(state, window, step=jnp.int32(0), key=jax.random.key(1))
     two, _ = wild.update(state, window, step=jnp.int32(0), key=jax.random.key(2))
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
-    host, rng = loop.on_host(state.actor), np.random.default_rng(0)
+    host, rng = learner.on_host(state.actor), np.random.default_rng(0)
     explore = wild.explorer(SPEC.action_dim, rng)
     actions = [explore(host, np.asarray(window.obs[0, 0]), 0) for _ in range(200)]
     assert np.std(actions) > 0.4 and np.abs(actions).max() <= 1

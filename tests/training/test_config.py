@@ -13,17 +13,25 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import pytest
 
-from pcil.agents import AGENTS, DrQV2
+from pcil.agents import AGENTS, BC, DrQV2
 from pcil.envs import TASKS
 from pcil.errors import InputError, check_kinds
+from pcil.files import flat
 from pcil.rewards import PCIL, REWARDS, TaskReward
 from pcil.training import presets
-from pcil.training.config import Run, completed, differences, registered, renamed
+from pcil.training.config import Run, differences, registered, renamed
 
 EVERY_RUN = sorted(presets.METHOD_SETTINGS)
 
 
 @dataclass(frozen=True)
+@dataclass(frozen=True)
+class Needy(TaskReward):
+    """Has a setting without a default."""
+
+    weight: float = field(kw_only=True)
+
+
 class WholeEpisodes(TaskReward):
     """Like PWIL's reward, it needs the steps of an episode in order."""
 
@@ -136,21 +144,47 @@ def test_fields_that_one_side_lacks_are_differences() -> None:
 
 def test_a_setting_that_an_older_run_lacks_had_its_classes_default() -> None:
     """So a run of an older version goes on, and only a value that changes what it did is a difference."""
-    run = presets.make("walker_walk")
+    run = dataclasses.replace(presets.make("walker_walk"), clip_actions=True)
     older = to_json(run)
     del older["agent"]["noise_correlation"], older["agent"]["normalize_observations"], older["agent"]["noise"]["end"]
-    found = differences(completed(older, to_json(run.plain)), to_json(run))
-    assert run.agent.standardise and not DrQV2().standardise
-    assert found == ["agent.standardise was False, now True"]
+    del older["agent"]["absorbing"], older["clip_actions"]
+    found = differences(flat(to_json(Run.from_json(older))), flat(to_json(run)))
+    assert run.agent.normalize_observations and not DrQV2().normalize_observations
+    assert sorted(found) == [
+        "agent.absorbing was False, now None",
+        "agent.normalize_observations was False, now True",
+        "clip_actions was False, now True",
+    ]
 
 
-def test_what_a_reward_cannot_do_without_is_kept_where_the_rest_is_plain() -> None:
-    @dataclasses.dataclass(frozen=True)
-    class Needy(TaskReward):
-        weight: float = dataclasses.field(kw_only=True)
+@pytest.mark.parametrize(("method", "preset"), presets.METHOD_SETTINGS)
+def test_from_json_gives_back_the_run_that_was_written(method: str, preset: str) -> None:
+    run = presets.make("walker_walk", method, preset, seed=7, env_kwargs={"a": {"b": [1, 2.5]}})
+    assert Run.from_json(to_json(run)) == Run.from_json(flat(to_json(run))) == run
 
-    plain = dataclasses.replace(presets.make("walker_walk", "expert"), reward=Needy(weight=3.0, task_weight=2.0)).plain
-    assert plain.reward == Needy(weight=3.0)
+
+def test_a_class_that_a_file_names_is_made_only_where_it_is_given() -> None:
+    """Also where it can't be made without one of its settings."""
+    run = dataclasses.replace(presets.make("walker_walk", "expert"), reward=Needy(weight=3.0, task_weight=2.0))
+    path = f"{Needy.__module__}:Needy"
+    with pytest.raises(InputError, match=f"The reward '{path}' is none of ours"):
+        Run.from_json(to_json(run))
+    assert Run.from_json(to_json(run), {path: Needy}) == run
+
+
+def test_a_setting_by_the_name_of_an_older_version_is_the_one_of_today() -> None:
+    run = presets.make("walker_walk", **{"agent.standardise": False})
+    assert run == presets.make("walker_walk", **{"agent.normalize_observations": False})
+    older = to_json(run)
+    older["agent"]["standardise"] = older["agent"].pop("normalize_observations")
+    assert Run.from_json(older) == run
+
+
+def test_an_agent_by_its_name_has_those_settings_of_the_preset_that_it_has() -> None:
+    run = presets.make("walker_walk", agent="bc")
+    assert run.agent == BC(batch_size=128, n_step=1, learning_rate=5e-4, normalize_observations=True)
+    with pytest.raises(InputError, match=r"--agent 'nobody' can't be loaded .* one of drqv2, bc, or my.module:MyAgent"):
+        presets.make("walker_walk", agent="nobody")
 
 
 def test_how_often_to_save_is_no_difference() -> None:
@@ -308,4 +342,4 @@ def test_classes_go_by_their_names_in_the_registry_and_paths_of_older_files_are_
     now = presets.make("walker_walk").to_json()
     old = {**now, "agent": {**now["agent"], "class": "pcil.agents.drqv2:DrQV2"}}
     old |= {"reward": {**now["reward"], "class": "pcil.rewards.pcil:PCIL"}}
-    assert old != now and renamed(old) == renamed(now) == now
+    assert old != now and renamed(flat(old)) == renamed(flat(now)) == flat(now)

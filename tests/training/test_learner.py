@@ -26,7 +26,7 @@ from pcil.training import collect, learner, loop
 from pcil.training.config import Algorithm, Run
 from pcil.training.learner import Learner
 from pcil.training.state import State, start
-from pcil.types import Episode, Spec, Window
+from pcil.types import Batch, Episode, Spec, Window
 from small import POINT_MASS, random_batch, small_run, windows
 
 OBS, ACTION = 2, 2
@@ -55,12 +55,12 @@ class Recorder(Reward):
         expert, agent = (jnp.zeros((self.batch_size, OBS)) for _ in range(2))
         return {"updates": jnp.float32(0), "draw": draw(key), "expert": expert, "agent": agent, "features": jnp.float32(-1)}
 
-    def update(self, state: Any, expert: Window, agent: Window, embed: Any, *, key: Any) -> tuple[dict[str, Any], Any]:
+    def update(self, state: Any, expert: Batch, agent: Batch, embed: Any, *, key: Any) -> tuple[dict[str, Any], Any]:
         rows = {"expert": expert.obs[:, 0], "agent": agent.obs[:, 0], "features": embed.weight[0, 0]}
         return {"updates": state["updates"] + 1, "draw": draw(key), **rows}, {"was": state["updates"]}
 
-    def reward(self, state: Any, obs: Any, action: Any, embed: Any, *, key: Any) -> jnp.ndarray:
-        return jnp.resize(jnp.stack([state["updates"], embed.weight[0, 0], draw(key)]), len(obs))
+    def reward(self, state: Any, batch: Batch, embed: Any, *, key: Any) -> jnp.ndarray:
+        return jnp.resize(jnp.stack([state["updates"], embed.weight[0, 0], draw(key)]), len(batch.obs))
 
 
 @dataclass(frozen=True)
@@ -114,15 +114,15 @@ def rows(seed: int, number: int, n: int = 1) -> Window:
     return window._replace(reward=np.arange(window.reward.size, dtype=np.float32).reshape(window.reward.shape) + 100)
 
 
-WINDOW, EXPERT, SEEN = rows(1, 6), rows(2, 3), rows(3, 3)
+WINDOW, EXPERT, LONGER = rows(1, 6), rows(2, 3), rows(3, 3)
 
 
-def after(label: Literal["sampled", "stored"], updates: int = 1, seen: Window | None = None) -> Learner:
+def after(label: Literal["sampled", "stored"], updates: int = 1, longer: Window | None = None) -> Learner:
     """The learner after some updates on the same windows; update `i` is at agent step `10 i`."""
     method = Algorithm(Scribe(), Recorder(), label)
     state = learner.init(method, SPEC, [random_batch(5, OBS, ACTION)], 0)
     for i in range(updates):
-        state, actor = learner.update(method, state, WINDOW, EXPERT, seen, np.int32(10 * i), np.int32(i))
+        state, actor = learner.update(method, state, WINDOW, EXPERT, longer, np.int32(10 * i), np.int32(i))
         assert float(actor.trunk.bias[0]) == i + 1, "the actor that is handed out is the one after the update"
     return state
 
@@ -148,7 +148,7 @@ def test_the_agent_learns_from_fresh_labels_or_from_stored_ones_and_from_all_els
 def test_the_reward_learns_from_the_experts_rows_and_the_first_rows_of_the_window_or_rows_of_its_own() -> None:
     state = after("stored").reward
     assert np.array_equal(state["expert"], EXPERT.obs[:, 0]) and np.array_equal(state["agent"], WINDOW.obs[:3, 0])
-    assert np.array_equal(after("stored", seen=SEEN).reward["agent"], SEEN.obs[:, 0])
+    assert np.array_equal(after("stored", longer=LONGER).reward["agent"], LONGER.obs[:, 0])
 
 
 def test_reward_label_and_agent_draw_from_three_keys_of_the_update_and_no_two_updates_share_one() -> None:

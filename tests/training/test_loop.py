@@ -19,11 +19,12 @@ import numpy as np
 import pytest
 
 from pcil import envs
-from pcil.errors import InputError
+from pcil.errors import InputError, RunError
 from pcil.policy import load_policy
 from pcil.training import checkpoint, collect, learner, loop, presets, runs
-from pcil.training.callbacks import Callback
+from pcil.training.callbacks import Callback, History
 from pcil.training.config import Run
+from pcil.training.evaluate import Evaluation
 from pcil.training.state import WALL_CLOCK, start
 from pcil.types import Spec
 from small import POINT_MASS, random_batch, save_point_mass_demos, small_run, windows
@@ -109,6 +110,9 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
 
+    class PowerCut(BaseException):
+        pass
+
     class Crash(Callback):
         """Dies at the end of its second episode."""
 
@@ -117,15 +121,90 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
         def episode(self, row: dict[str, Any]) -> None:
             self.episodes += 1
             if self.episodes == 2:
-                raise RuntimeError("the power went")
+                raise PowerCut
 
     with pytest.raises(loop.Stopped):
         runs.execute(run, tmp_path / "crashed", [StopAfter(2)])
-    with pytest.raises(RuntimeError, match="power"):
+    with pytest.raises(PowerCut):
         runs.execute(run, tmp_path / "crashed", [Crash()])
     assert len(rows(tmp_path / "crashed")[1]) == 4, "two episodes more than the checkpoint has"
     finish(run, tmp_path / "crashed")
     same_run(tmp_path / "whole", tmp_path / "crashed")
+
+
+def test_a_callback_that_fails_ends_the_run_saved_and_is_named(demos: str, tmp_path: Path) -> None:
+    """The episode of which it was told is not lost: the same command goes on with the next one."""
+    run = small_run(demos=demos)
+    finish(run, tmp_path / "whole")
+
+    class Broken(Callback):
+        """A logger whose server is gone."""
+
+        def episode(self, row: dict[str, Any]) -> None:
+            if row["episode"] == 3:
+                raise ConnectionError("no server")
+
+    with pytest.raises(RunError, match=r"Broken raised ConnectionError \(no server\) in episode"):
+        runs.execute(run, tmp_path / "broken", [Broken()])
+    assert [row["episode"] for row in rows(tmp_path / "broken")[1]] == [1, 2, 3]
+    told = StopAfter(-1)
+    runs.execute(run, tmp_path / "broken", [told])
+    assert "Resuming at 150 of 300 frames." in told.said
+    same_run(tmp_path / "whole", tmp_path / "broken")
+
+
+def test_callbacks_are_told_every_row_and_every_evaluation_and_what_was_logged_before(demos: str, tmp_path: Path) -> None:
+    """A logger of one's own gets what the files get, in their order, and on resume what they held."""
+
+    class Logger(Callback):
+        def __init__(self) -> None:
+            self.told: list[Any] = []
+
+        def begin(self, run: Run, folder: Path, history: History) -> None:
+            self.told.append(("begin", folder, [row["episode"] for row in history.episodes], len(history.evaluations)))
+
+        def episode(self, row: dict[str, Any]) -> None:
+            self.told.append(row)
+
+        def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
+            self.told.append((frames, result.returns.tolist()))
+
+        def end(self) -> None:
+            self.told.append("end")
+
+    run, first, second = small_run(demos=demos), Logger(), Logger()
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "run", [StopAfter(3), first])
+    runs.execute(run, tmp_path / "run", [second])
+    assert first.told[0] == ("begin", tmp_path / "run", [], 0) and second.told[0] == ("begin", tmp_path / "run", [1, 2, 3], 4)
+    assert first.told[-1] == second.told[-1] == "end"
+    told = [*first.told[1:-1], *second.told[1:-1]]
+    lines = [json.loads(line) for line in (tmp_path / "run" / "train.jsonl").read_text().splitlines()]
+    assert [row for row in told if isinstance(row, dict)] == lines and len(lines) == 6
+    table = [line.split(",") for line in (tmp_path / "run" / "eval.csv").read_text().splitlines()[1:]]
+    evaluations = [entry for entry in told if isinstance(entry, tuple)]
+    assert [float(row[2]) for row in table] == [value for _, returns in evaluations for value in returns]
+    assert [frames for frames, _ in evaluations] == [0, 100, 200, 300]
+
+
+@pytest.mark.parametrize("num_envs", [2, 3])
+def test_several_environments_are_played_side_by_side_and_resume_exactly(num_envs: int, demos: str, tmp_path: Path) -> None:
+    run = small_run(demos=demos, num_envs=num_envs)
+    finish(run, tmp_path / "whole")
+    table, lines = rows(tmp_path / "whole")
+    assert [line["episode"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert [line["frames"] for line in lines] == [50 * num_envs * ((i // num_envs) + 1) for i in range(6)]
+    assert [line["return"] for line in lines[:num_envs]] == [line["return"] for line in one_by_one(demos, tmp_path)[:num_envs]]
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, tmp_path / "stopped", [StopAfter(1)])
+    runs.execute(run, tmp_path / "stopped")
+    same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+def one_by_one(demos: str, folder: Path) -> list[dict[str, Any]]:
+    """The rows of the same run in one environment, whose first episodes are the same: nothing is learned before 100 frames."""
+    finish(small_run(demos=demos, random_frames=200), folder / "single")
+    return rows(folder / "single")[1]
 
 
 def test_a_damaged_checkpoint_is_passed_over_and_said(demos: str, tmp_path: Path) -> None:
@@ -437,12 +516,12 @@ def test_the_actor_that_update_returns_outlives_the_next_update() -> None:
     state = learner.init(run.learner, Spec(2, 2, 1), (), 0)
     window = windows(random_batch(35, 2, 2), 3)
     state, actor = learner.update(run.learner, state, window, None, None, np.int32(0), np.int32(0))
-    host = loop.on_host(actor)
+    host = learner.on_host(actor)
     before = host.head.weights[0].copy()
     assert np.array_equal(before, state.agent.actor.head.weights[0])
     state, newer = learner.update(run.learner, state, window, None, None, np.int32(1), np.int32(1))
     assert np.array_equal(host.head.weights[0], before)
-    assert not np.array_equal(loop.on_host(newer).head.weights[0], before)
+    assert not np.array_equal(learner.on_host(newer).head.weights[0], before)
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def init(algorithm: Algorithm, spec: Spec, demos: Sequence[Batch], seed: int | A
     key = jax.random.wrap_key_data(root)
     agent = algorithm.agent.init(spec, key=seeds.key(key, Stream.INIT_AGENT, 0))
     if demos:
-        agent = algorithm.agent.observe(agent, jnp.concatenate([demo.obs for demo in demos]))
+        agent = algorithm.agent.observe(agent, jnp.concatenate([demo.next_obs for demo in demos]))
     reward = algorithm.reward.init(demos, frozen_embed(algorithm, agent), key=seeds.key(key, Stream.INIT_REWARD, 0))
     learner = Learner(agent, reward, root, {})
     window = _zeros(spec, algorithm.agent.batch_size, max(algorithm.agent.n_step, algorithm.reward.span))

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import importlib
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -16,13 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pcil
+from pcil import cli
 from pcil.agents import BC, DrQV2
 from pcil.cli import COMMANDS
 from pcil.rewards import REWARDS, Reward, TaskReward
 from pcil.training import checkpoint, learner, presets
 from pcil.training.config import Run
 from pcil.types import Batch, Episode, Spec
-from small import narrow, random_batch, small_run, windows
+from small import POINT_MASS, narrow, random_batch, save_point_mass_demos, small_run, windows
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -150,7 +153,7 @@ def test_the_settings_tables_say_what_the_code_says() -> None:
 
 def load_example(folder: Path, monkeypatch: pytest.MonkeyPatch) -> type[Reward]:
     """The example reward of architecture.md, imported as a user's module would be."""
-    (text,) = blocks(ROOT / "docs" / "architecture.md", "python")
+    text, _ = blocks(ROOT / "docs" / "architecture.md", "python")
     (folder / "nearest_example.py").write_text(text)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setitem(sys.modules, "nearest_example", None)
@@ -196,6 +199,25 @@ def test_the_example_reward_goes_through_the_compiled_step(tmp_path: Path, monke
     assert np.allclose(learned[:9], 0, atol=1e-2) and learned[9] < -1
 
 
+def test_the_example_agent_clones_the_expert_and_leaves_a_policy_that_loads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command that the page gives. The policy's file names its class, so without `--trust` it is refused."""
+    _, text = blocks(ROOT / "docs" / "architecture.md", "python")
+    (Path.cwd() / "cloning_example.py").write_text(text)
+    demos = save_point_mass_demos(tmp_path)
+    words = f"train {POINT_MASS} --method bc --agent cloning_example:LinearCloning --demos {demos} --frames 3000 --out run"
+    assert cli.main(words.split()) == 0
+    rows = [json.loads(line) for line in Path("run/train.jsonl").read_text().splitlines()]
+    assert rows[-1]["agent/loss"] < 0.7 * rows[0]["agent/loss"]
+    assert json.loads(Path("run/run.json").read_text())["run"]["agent"]["class"] == "cloning_example:LinearCloning"
+    assert cli.main(words.split()) == 0 and "is done" in capsys.readouterr().out
+    assert cli.main(["evaluate", "run"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
+    assert cli.main(["evaluate", "run", "--episodes", "2", "--trust", "cloning_example"]) == 0
+    policy, obs = pcil.load_policy("run", ["cloning_example"]), np.ones((3, 2), np.float32)
+    assert np.allclose(policy(obs), np.tanh(obs @ policy.actor.weight)) and policy.spec[:2] == (2, 2)
+
+
 def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     """`python docs/make_cli.py` mends it."""
     spec = importlib.util.spec_from_file_location("make_cli", ROOT / "docs" / "make_cli.py")
@@ -223,8 +245,6 @@ def test_the_map_in_the_readme_has_every_file_once() -> None:
 
 def test_the_python_in_the_docs_is_python() -> None:
     """It compiles, and what it takes from `pcil` is there."""
-    import pcil
-
     for page in PAGES:
         for text in blocks(page, "python"):
             tree = ast.parse(text)

@@ -11,6 +11,8 @@ import importlib
 
 __version__ = "0.1.0"
 __all__ = [
+    "Agent",
+    "Callback",
     "Demonstrations",
     "Episode",
     "InputError",
@@ -24,6 +26,8 @@ __all__ = [
 ]
 
 _HOME = {
+    "Agent": ("pcil.agents", "Agent"),
+    "Callback": ("pcil.training.callbacks", "Callback"),
     "Demonstrations": ("pcil.demos", "Demonstrations"),
     "Episode": ("pcil.types", "Episode"),
     "InputError": ("pcil.errors", "InputError"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from pcil import files
+from pcil import files, modules
 from pcil.errors import InputError
 from pcil.nets.networks import MLP, Actor, Normalizer, Trunk
 from pcil.types import Spec
@@ -26,14 +27,19 @@ LARGEST = 2**30
 class Policy:
     """The mean action of a trained actor: `policy(obs [*, obs]) -> action [*, action]`, float32 in [-1, 1]."""
 
-    actor: Actor
+    actor: Any
     task: str
     info: dict[str, Any] = field(default_factory=dict)
     """Where it comes from: method, frames, seed, settings, commit."""
+    sizes: Spec | None = None
+    """Those of observation and action, which an actor of ours has itself."""
 
     @property
     def spec(self) -> Spec:
         """Sizes of observation and action."""
+        if not isinstance(self.actor, Actor):
+            assert self.sizes is not None
+            return self.sizes
         obs_dim, action_dim = self.actor.trunk.weight.shape[0], self.actor.head.biases[-1].shape[0]
         return Spec(obs_dim, action_dim, self.info.get("action_repeat", 1))
 
@@ -67,8 +73,12 @@ class Policy:
         each by a rename, so neither is ever half written."""
         folder.mkdir(parents=True, exist_ok=True)
         arrays = _named(self.actor)
-        text = json.dumps({"format": FORMAT, "task": self.task, "layers": len(self.actor.head.weights), "info": self.info})
-        text += "\n"
+        if isinstance(self.actor, Actor):
+            kind: dict[str, Any] = {"layers": len(self.actor.head.weights)}
+        else:
+            named = f"{type(self.actor).__module__}:{type(self.actor).__qualname__}"
+            kind = {"class": named, "sizes": [self.spec.obs_dim, self.spec.action_dim]}
+        text = json.dumps({"format": FORMAT, "task": self.task, **kind, "info": self.info}) + "\n"
         checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"  # one entry: of more the order is random
         files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": checksums})
         (folder / "policy.json.tmp").write_text(text)
@@ -88,10 +98,11 @@ def as_saved(folder: Path) -> bool:
     return told in ("", hashlib.sha256((folder / "policy.json").read_bytes()).hexdigest())
 
 
-def load_policy(path: str | Path) -> Policy:
+def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
     """The policy of a run folder, or of a folder that holds `policy.safetensors` and `policy.json`.
 
-    Raises `InputError` where there is none or where the files are damaged.
+    `trust` are the modules that it may name for an actor that is none of ours. Raises `InputError` where there is none or where
+    the files are damaged.
     """
     from safetensors import SafetensorError
 
@@ -104,6 +115,13 @@ def load_policy(path: str | Path) -> Policy:
     try:
         header = files.read_json(folder / "policy.json")
         arrays = _read(folder / "policy.safetensors")
+        own = header.get("class")
+        if own is not None:
+            modules.admit(f"The policy in {folder}", modules.of_class(own), trust)
+            kind = modules.load("The policy's class", own, object, "my.module:MyActor")
+            obs_dim, action_dim = map(int, header["sizes"])
+            sizes = Spec(obs_dim, action_dim, header["info"].get("action_repeat", 1))
+            return Policy(kind.from_arrays(arrays), header["task"], header["info"], sizes)
         actor = _build(header, arrays)
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, SafetensorError, OSError) as error:
         raise InputError(
@@ -112,7 +130,7 @@ def load_policy(path: str | Path) -> Policy:
     return Policy(actor, header["task"], header.get("info", {}))
 
 
-def _named(actor: Actor) -> dict[str, np.ndarray]:
+def _named(actor: Any) -> dict[str, np.ndarray]:
     """Arrays by their path in the tree, such as `head.weights.0`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(actor, eqx.is_array))
     return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}

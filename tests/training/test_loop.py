@@ -191,7 +191,7 @@ def test_callbacks_are_told_every_row_and_every_evaluation_and_what_was_logged_b
 def test_several_environments_are_played_side_by_side_and_resume_exactly(num_envs: int, demos: str, tmp_path: Path) -> None:
     run = small_run(demos=demos, num_envs=num_envs)
     finish(run, tmp_path / "whole")
-    table, lines = rows(tmp_path / "whole")
+    _, lines = rows(tmp_path / "whole")
     assert [line["episode"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert [line["frames"] for line in lines] == [50 * num_envs * ((i // num_envs) + 1) for i in range(6)]
     assert [line["return"] for line in lines[:num_envs]] == [line["return"] for line in one_by_one(demos, tmp_path)[:num_envs]]

@@ -6,17 +6,31 @@ import abc
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, Literal
+from types import ModuleType
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.errors import check_kinds, check_ranges
-from pcil.nets.networks import Actor, Trunk
 from pcil.types import Spec, Window
 
+
+@runtime_checkable
+class Actor(Protocol):
+    """What acts: a pytree of arrays, such as an `equinox.Module`, that maps observations to actions in [-1, 1].
+
+    `pcil.nets.networks:Actor` is ours. Another one has a class method `from_arrays`, for a policy is saved as arrays by their
+    paths in the tree: `from_arrays({"weight": ...})` gives back the actor whose field `weight` that was.
+    """
+
+    def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = ...) -> Float[Any, "*batch action"]:
+        """The mean action, by `jax.numpy` or `numpy`."""
+        ...
+
+
 Metrics = dict[str, Float[Array, ""]]
-Explorer = Callable[[Actor, np.ndarray, int], np.ndarray]
+Explorer = Callable[[Any, np.ndarray, int], np.ndarray]
 """`(actor, obs [obs], agent steps so far) -> action [action]`."""
 
 
@@ -59,8 +73,8 @@ class Agent(abc.ABC):
         """The part of the state that acts; it is all that leaves the device between updates."""
 
     @abc.abstractmethod
-    def trunk(self, state: Any, whose: Literal["critic", "actor"]) -> Trunk:
-        """The features of an observation on which imitation rewards are learned; they are not trained by them."""
+    def trunk(self, state: Any, whose: Literal["critic", "actor"]) -> Callable[[Any], Any]:
+        """The features of an observation on which imitation rewards are learned, a pytree; they are not trained by them."""
 
     @abc.abstractmethod
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:

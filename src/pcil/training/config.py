@@ -134,6 +134,12 @@ class Run:
         return Algorithm(self.agent, self.reward, self.label)
 
     @property
+    def own_modules(self) -> tuple[str, ...]:
+        """The modules of an agent and a reward that are none of ours."""
+        kinds = type(self.agent), type(self.reward)
+        return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not kind.__module__.startswith("pcil.")))
+
+    @property
     def needs_demos(self) -> bool:
         """Whether demonstrations are used at all."""
         return self.reward.needs_demos or self.agent.offline

@@ -51,7 +51,7 @@ def playable(folder: Path, env_kwargs: dict[str, Any] | None, trust: Sequence[st
 
     `InputError` where these files name a module that is not among those to `trust`.
     """
-    policy = load_policy(folder)
+    policy = load_policy(folder, trust)
     modules.admit(f"The policy in {folder}", modules.of_task(policy.task, env_kwargs is None and policy.env_kwargs), trust)
     modules.admit("--env-kwargs", modules.of_task("", env_kwargs), None)
     return policy, policy.env_kwargs if env_kwargs is None else env_kwargs

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil import seeds
-from pcil.nets.networks import Actor, Trunk
-from pcil.rewards import Reward, label
+from pcil.agents import Actor
+from pcil.rewards import Embed, Reward, label
 from pcil.seeds import Stream
 from pcil.training.config import Algorithm
 from pcil.types import Batch, Episode, Spec, Window
@@ -63,7 +63,7 @@ def _zeros(spec: Spec, rows: int, n: int) -> Window:
     return Window(obs, action, reward, discount, jnp.zeros(rows, jnp.int32))
 
 
-def frozen_embed(algorithm: Algorithm, agent: Any) -> Trunk:
+def frozen_embed(algorithm: Algorithm, agent: Any) -> Embed:
     """The agent's features of an observation, through which no gradient flows."""
     return jax.lax.stop_gradient(algorithm.agent.trunk(agent, algorithm.reward.trunk))
 
@@ -130,7 +130,7 @@ def steps(window: Window) -> Batch:
 
 def _largest(tree: Any) -> Float[Array, ""]:
     """The largest absolute value; not finite where any is not."""
-    return functools.reduce(jnp.maximum, (jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)))
+    return functools.reduce(jnp.maximum, (jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
 def checks(names: Iterable[str]) -> list[str]:

@@ -38,11 +38,13 @@ class Result:
     """Mean return of the last evaluation."""
     demos_return: float | None
     """Mean return of the demonstrations, where there were any with rewards."""
+    own_modules: tuple[str, ...] = ()
+    """Where an agent and a reward of a person's own are from."""
 
     @property
     def policy(self) -> Policy:
         """What was learned."""
-        return load_policy(self.folder)
+        return load_policy(self.folder, self.own_modules)
 
 
 def train(
@@ -111,7 +113,7 @@ def execute(
     run, demos, why = prepared(run, say, task=task, given=demos)
     with _claimed(folder), files.room_for(f"The run in {folder}"), _withdrawn_if_refused(folder):
         _describe(folder, run, demos, say)
-        if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder))):
+        if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder), run.own_modules)):
             say(why_not)
             (folder / "DONE").unlink()
         if not (folder / "DONE").exists():
@@ -122,7 +124,7 @@ def execute(
                 ended = loop.train_loop(run, folder, episodes, callbacks, task=task, demos_return=paid)
                 final = ended.counters.final_return
             files.write_text(folder / "DONE", json.dumps({"final_return": final}) + "\n")
-        return Result(folder, read_done(folder), demos.return_mean if demos else None)
+        return Result(folder, read_done(folder), demos.return_mean if demos else None, run.own_modules)
 
 
 @contextlib.contextmanager

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pcil import envs
+from pcil.agents import Actor
 from pcil.errors import InputError, RunError
-from pcil.nets.networks import Actor
 from pcil.policy import Policy, as_saved, load_policy
 from pcil.training import checkpoint, learner
 from pcil.training.callbacks import LOGS, Callback, LogFiles
@@ -162,7 +162,7 @@ def save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: f
         "action_repeat": spec.action_repeat,
         "env_kwargs": run.env_kwargs,
     }
-    Policy(on_host(state.actor), envs.task_name(run.task), info).save(folder / "policy")
+    Policy(on_host(state.actor), envs.task_name(run.task), info, spec).save(folder / "policy")
 
 
 def take_means(state: State) -> dict[str, Any]:
@@ -217,14 +217,15 @@ def _beginning(log: Path, length: int, say: Callable[[str], None]) -> str:
     return content.decode(errors="replace")
 
 
-def unfinished(folder: Path, final_return: float) -> str | None:
+def unfinished(folder: Path, final_return: float, trust: Sequence[str] = ()) -> str | None:
     """What is wrong with a folder whose DONE has this final return, in a sentence, or None; its last checkpoint mends it.
 
-    `InputError` where the policy is damaged and there is no checkpoint that could.
+    `InputError` where the policy is damaged and there is no checkpoint that could. `trust` are the modules that
+    the policy may name.
     """
     arrays, meta, _ = checkpoint.restore(folder / "checkpoint")
     try:
-        load_policy(folder)
+        load_policy(folder, trust)
         damage = None if as_saved(folder / "policy") else f"{folder / 'policy' / 'policy.json'} is not what the run had written"
     except InputError as error:
         damage = str(error).partition(";")[0]

@@ -17,7 +17,7 @@ from PIL import Image
 from fake_runs import fake_run, fake_sweep
 from pcil.errors import InputError
 from pcil.report import load, page
-from pcil.report.load import Collection, Dot
+from pcil.report.load import Collection, TransitionRow
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = "--no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update --disable-sync"
@@ -38,7 +38,7 @@ def everything(folder: Path) -> Collection:
     rng = np.random.default_rng(0)
     for task, method, variant, seed in sorted(found.sources, key=lambda name: (name[0], name[1] != "pcil", *name)):
         for reward in [None] * 8 + rng.random(16).tolist():
-            found.dots.append(Dot(task, method, variant, seed, 2000, reward, *rng.random(4).tolist()))
+            found.transitions.append(TransitionRow(task, method, variant, seed, 2000, reward, *rng.random(4).tolist()))
     return found
 
 

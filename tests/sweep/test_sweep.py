@@ -281,7 +281,7 @@ def test_the_table_says_where_every_run_is() -> None:
     jobs[0].state, jobs[0].frames, jobs[0].rate, jobs[0].last_return = "running", 1000, 50.0, 12.25
     jobs[1].state, jobs[1].frames, jobs[1].last_return = "done", 4000, 800.0
     screen = Console(file=io.StringIO(), width=120)
-    screen.print(sweep.picture(jobs, speed=10.0, room=9))
+    screen.print(sweep.progress_table(jobs, speed=10.0, room=9))
     title, first, second, total = (" ".join(line.split()) for line in screen.file.getvalue().splitlines())
     assert title == "run task method seed frames return frames/s time left"
     assert first == "expert pendulum_swingup expert 1 running 1,000/4,000 12.2 50 0:01:00"
@@ -293,7 +293,7 @@ def test_names_in_the_table_are_no_markup() -> None:
     (job,) = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1]").jobs
     job.run = dataclasses.replace(job.run, task="[/red]\x1b[2J")
     screen = Console(file=io.StringIO(), width=120)
-    screen.print(sweep.picture([job], speed=0.0, room=2))
+    screen.print(sweep.progress_table([job], speed=0.0, room=2))
     assert "[/red]\\x1b[2J" in screen.file.getvalue()
 
 
@@ -301,7 +301,7 @@ def test_where_room_is_short_the_running_runs_are_shown() -> None:
     jobs = plan("[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1, 2, 3, 4, 5]").jobs
     jobs[3].state = "running"
     screen = Console(file=io.StringIO(), width=120)
-    screen.print(sweep.picture(jobs, speed=0.0, room=2))
+    screen.print(sweep.progress_table(jobs, speed=0.0, room=2))
     assert [line.split()[3:5] for line in screen.file.getvalue().splitlines()[1:3]] == [["4", "running"], ["1", "waiting"]]
 
 

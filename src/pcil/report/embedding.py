@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import spearmanr
 
-from pcil.report.load import Dot, Point
+from pcil.report.load import EvalRow, TransitionRow
 
 
 def project(
-    expert: Float[np.ndarray, "experts dim"], agent: Float[np.ndarray, "T dim"], reward: Float[np.ndarray, " T"], run: Point
-) -> list[Dot]:
+    expert: Float[np.ndarray, "experts dim"], agent: Float[np.ndarray, "T dim"], reward: Float[np.ndarray, " T"], run: EvalRow
+) -> list[TransitionRow]:
     """A row for each transition, experts first; `reward` is what the environment paid the agent, `run` says whose it is."""
     from sklearn.manifold import TSNE
     from sklearn.metrics import silhouette_samples
@@ -26,16 +26,16 @@ def project(
     rewards = [None] * len(expert) + [_short(value) for value in reward]
     rows = np.column_stack([distance, silhouette, places])
     head = (run.task, run.method, run.variant, run.seed, run.frames)
-    return [Dot(*head, own, *map(_short, row)) for own, row in zip(rewards, rows, strict=True)]
+    return [TransitionRow(*head, own, *map(_short, row)) for own, row in zip(rewards, rows, strict=True)]
 
 
-def measures(dots: Sequence[Dot]) -> tuple[float, float]:
+def measures(transitions: Sequence[TransitionRow]) -> tuple[float, float]:
     """Spearman's correlation of distance and reward over the agent's transitions, and the experts' mean silhouette.
 
     The first is NaN where all rewards or all distances are the same.
     """
-    agent = np.array([(dot.distance, dot.reward) for dot in dots if dot.reward is not None])
-    expert = [dot.silhouette for dot in dots if dot.reward is None]
+    agent = np.array([(row.distance, row.reward) for row in transitions if row.reward is not None])
+    expert = [row.silhouette for row in transitions if row.reward is None]
     constant = np.ptp(agent, axis=0).min() == 0
     return math.nan if constant else float(np.asarray(spearmanr(*agent.T))[0]), float(np.mean(expert))
 

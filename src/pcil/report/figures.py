@@ -14,7 +14,7 @@ import numpy as np
 
 from pcil.errors import shown
 from pcil.report import stats
-from pcil.report.load import OFFLINE, Dot, Point, curves, label, matrix, read_run
+from pcil.report.load import OFFLINE, EvalRow, TransitionRow, curves, label, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -72,7 +72,7 @@ def words(text: str) -> str:
     return shown(text, 70).replace("$", "\\$")
 
 
-def styles(rows: Iterable[Point | Dot]) -> dict[tuple[str, str], Style]:
+def styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, str], Style]:
     """A look for each method and variant: the method's own, and another one for each further variant of it."""
     found: dict[tuple[str, str], Style] = {}
     spare = 0
@@ -88,14 +88,14 @@ def styles(rows: Iterable[Point | Dot]) -> dict[tuple[str, str], Style]:
 
 def run_curve(folder: Path, expert_return: float | None) -> Path:
     """Draw one run's learning curve as `curve.png` in its folder, and return that path."""
-    points = read_run(folder)
-    task, method, preset, seed = points[0][:4]
-    frames = [point.frames for point in points]
+    rows = read_run(folder)
+    task, method, preset, seed = rows[0][:4]
+    frames = [row.frames for row in rows]
     figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
-    low, high = [point.return_low for point in points], [point.return_high for point in points]
+    low, high = [row.return_low for row in rows], [row.return_high for row in rows]
     colour = STYLES.get(method, OTHERS[0]).colour
     axis.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
-    axis.plot(frames, [point.return_mean for point in points], color=colour, marker="o", markersize=3, label="mean")
+    axis.plot(frames, [row.return_mean for row in rows], color=colour, marker="o", markersize=3, label="mean")
     drawn = low + high
     if expert_return is not None:
         drawn.append(_expert(axis, expert_return))
@@ -108,7 +108,7 @@ def run_curve(folder: Path, expert_return: float | None) -> Path:
 
 
 def grid(
-    points: Sequence[Point],
+    rows: Sequence[EvalRow],
     path: Path,
     columns: int = 3,
     value: str = "return_mean",
@@ -119,13 +119,13 @@ def grid(
     A method that takes no step in the environment is a level line at its last return. `value` is the column that is drawn;
     seeds and expert only for returns. PNG and PDF are written to `path`, SVG is returned.
     """
-    looks = looks or styles(points)
-    points = [point for point in points if getattr(point, value) is not None]
-    tasks = list(dict.fromkeys(point.task for point in points))
+    looks = looks or styles(rows)
+    rows = [row for row in rows if getattr(row, value) is not None]
+    tasks = list(dict.fromkeys(row.task for row in rows))
     figure, axes = _axes(len(tasks), columns)
     for axis, task in zip(axes, tasks, strict=True):
-        mine = curves(point for point in points if point.task == task)
-        drawn = [getattr(point, value) for runs in mine.values() for run in runs for point in run]
+        mine = curves(row for row in rows if row.task == task)
+        drawn = [getattr(row, value) for runs in mine.values() for run in runs for row in run]
         for name in (name for name in looks if (task, *name) in mine):
             if name[0] in OFFLINE:
                 _level(axis, matrix(mine[task, *name], value)[1][:, -1].mean(), looks[name], words(label(name, looks)))
@@ -139,14 +139,14 @@ def grid(
     return save(figure, path)
 
 
-def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], Style]) -> str:
+def aggregate(rows: Sequence[EvalRow], path: Path, looks: dict[tuple[str, str], Style]) -> str:
     """Share of the expert's return over frames: IQM over all seeds of all tasks of a method, with its bootstrap interval.
 
     The legend says of how many tasks where methods have not the same number of them. Nothing is drawn, and "" returned, where
     no task's expert is known.
     """
     strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
-    for name, runs in curves(points).items():
+    for name, runs in curves(rows).items():
         frames, returns = matrix(runs)
         if (share := stats.share_of_expert(runs, returns)) is not None:
             strata.setdefault(name[1:], []).append((frames, share))
@@ -171,15 +171,15 @@ def aggregate(points: Sequence[Point], path: Path, looks: dict[tuple[str, str], 
     return save(figure, path)
 
 
-def clouds(dots: Sequence[Dot], path: Path, columns: int | None = None) -> str:
+def clouds(transitions: Sequence[TransitionRow], path: Path, columns: int | None = None) -> str:
     """t-SNE of each method's representation: the first seed's transitions; by default a row a method and a column a task."""
-    first: dict[tuple[str, ...], list[Dot]] = {name: seeds[0] for name, seeds in curves(dots).items()}
+    first: dict[tuple[str, ...], list[TransitionRow]] = {name: seeds[0] for name, seeds in curves(transitions).items()}
     tasks, methods = (list(dict.fromkeys(name[part] for name in first)) for part in (slice(1), slice(1, 3)))
     figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
     for axis, name in zip(axes, ((*task, *method) for method in methods for task in tasks), strict=True):
         if name in first:
-            drawn = [dot for other, own in first.items() if other[0] == name[0] for dot in own]
-            rewards = [dot.reward for dot in drawn if dot.reward is not None]
+            drawn = [row for other, own in first.items() if other[0] == name[0] for row in own]
+            rewards = [row.reward for row in drawn if row.reward is not None]
             _cloud(axis, first[name], (min(rewards), max(rewards)))
         else:
             axis.axis("off")
@@ -222,7 +222,7 @@ def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> 
     return figure, list(axes.flat)[:panels]
 
 
-def _seeds(axis: Axes, runs: Sequence[Sequence[Point]], value: str, style: Style, name: str) -> None:
+def _seeds(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style: Style, name: str) -> None:
     """Each seed's return as a thin line, and their mean with its interval at the frames that all of them have."""
     for run in runs if value == "return_mean" else ():
         axis.plot([p.frames for p in run], [getattr(p, value) for p in run], color=style.colour, alpha=0.35, linewidth=0.7)
@@ -251,21 +251,21 @@ def _line(
     axis.plot(frames, middle, linewidth=1.8, label=label, **look)
 
 
-def _cloud(axis: Axes, dots: Sequence[Dot], ends: tuple[float, float]) -> None:
+def _cloud(axis: Axes, transitions: Sequence[TransitionRow], ends: tuple[float, float]) -> None:
     """The agent's transitions coloured by reward, the expert's above them in blue; `ends` are those of the colours, which all
     methods share on a task."""
-    expert, agent = ([dot for dot in dots if (dot.reward is None) == own] for own in (True, False))
+    expert, agent = ([row for row in transitions if (row.reward is None) == own] for own in (True, False))
     shared = {"s": 12, "linewidths": 0, "rasterized": True}
-    rewards = np.array([dot.reward for dot in agent], np.float64)
+    rewards = np.array([row.reward for row in agent], np.float64)
     shared |= {"cmap": REWARD_COLOURS, "vmin": ends[0], "vmax": ends[1]}
-    seen = axis.scatter([dot.x for dot in agent], [dot.y for dot in agent], c=rewards, **shared)
+    seen = axis.scatter([row.x for row in agent], [row.y for row in agent], c=rewards, **shared)
     look = {"color": BLUE, "markersize": 3.5, "markeredgewidth": 0, "linestyle": "", "rasterized": True}
-    axis.plot([dot.x for dot in expert], [dot.y for dot in expert], marker="^", label="expert", **look)
+    axis.plot([row.x for row in expert], [row.y for row in expert], marker="^", label="expert", **look)
     bar = axis.figure.colorbar(seen, ax=axis, label="true reward of an agent step", shrink=0.8)
     assert bar.solids is not None
     bar.solids.set_rasterized(True)
     axis.set(xticks=[], yticks=[])
-    task, method, variant, seed, frames = dots[0][:5]
+    task, method, variant, seed, frames = transitions[0][:5]
     axis.set_title(f"{words(f'{task}, {method}, {variant}')}\nseed {seed}, {frames:,} frames", fontsize=8)
 
 

@@ -27,7 +27,7 @@ UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, Recu
 """What reading a damaged file may raise."""
 
 
-class Point(NamedTuple):
+class EvalRow(NamedTuple):
     """One evaluation of one run; a row of `results/*.csv`."""
 
     task: str
@@ -50,7 +50,7 @@ class Point(NamedTuple):
     vary; None where there are none."""
 
 
-class Dot(NamedTuple):
+class TransitionRow(NamedTuple):
     """One transition in the representation that a reward has learned; a row of `representation.csv`."""
 
     task: str
@@ -70,7 +70,7 @@ class Dot(NamedTuple):
     """Where t-SNE put it."""
 
 
-Row = TypeVar("Row", Point, Dot)
+Row = TypeVar("Row", EvalRow, TransitionRow)
 
 
 class Source(NamedTuple):
@@ -85,8 +85,8 @@ class Source(NamedTuple):
 class Collection(NamedTuple):
     """All that was found below the paths of a report; `sources` goes by the first four values of a row."""
 
-    points: list[Point]
-    dots: list[Dot]
+    rows: list[EvalRow]
+    transitions: list[TransitionRow]
     sources: dict[tuple[str, str, str, int], Source]
     notes: list[str]
     """A sentence for each thing that was left out."""
@@ -97,50 +97,50 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
 
     `complete` adds to a run's settings those that are newer than the run.
     """
-    points, dots, sources, notes = found = Collection([], [], {}, [])
+    rows, transitions, sources, notes = found = Collection([], [], {}, [])
     folders: dict[Path, Path] = {}
     seen: dict[tuple[Any, ...], Path] = {}
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; give run folders, folders that hold some, or files like results/*.csv.")
         try:
-            rows = read_points(path) if path.is_file() else []
+            added = read_rows(path) if path.is_file() else []
         except InputError as error:
             notes.append(left_out(path, error))
             continue
-        others = {seen.setdefault((type(row), *row[:4]), path) for row in rows} - {path}
+        others = {seen.setdefault((type(row), *row[:4]), path) for row in added} - {path}
         notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
-        rows = [row for row in rows if seen[type(row), *row[:4]] == path]
-        points += (row for row in rows if isinstance(row, Point))
-        dots += (row for row in rows if isinstance(row, Dot))
+        added = [row for row in added if seen[type(row), *row[:4]] == path]
+        rows += (row for row in added if isinstance(row, EvalRow))
+        transitions += (row for row in added if isinstance(row, TransitionRow))
         folders |= {file.parent.resolve(): file.parent for file in sorted(path.rglob("run.json"))}
     runs = []
     for folder in folders.values():
         try:
-            rows, run, torn = _read(folder)
+            run_rows, run, torn = _read(folder)
             notes += [left_out(folder, "the end of eval.csv, whose last line is half written")] if torn else []
-            runs.append((rows, Source(folder, complete(flat(run)), (folder / "DONE").exists())))
+            runs.append((run_rows, Source(folder, complete(flat(run)), (folder / "DONE").exists())))
         except UNREADABLE as error:
             notes.append(left_out(folder, error))
-    for (rows, source), variant in zip(runs, variants([source.settings for _, source in runs]), strict=True):
-        name = (*rows[0][:2], variant, rows[0].seed)
+    for (run_rows, source), variant in zip(runs, variants([source.settings for _, source in runs]), strict=True):
+        name = (*run_rows[0][:2], variant, run_rows[0].seed)
         first = sources.setdefault(name, source)
         if first is source:
-            points[:] = [point for point in points if point[:4] != name]
-            points += (row._replace(variant=variant) for row in rows)
+            rows[:] = [row for row in rows if row[:4] != name]
+            rows += (row._replace(variant=variant) for row in run_rows)
         else:
             notes.append(f"{source.folder} holds the same run as {first.folder}, which is shown.")
-    if not points:
+    if not rows:
         where = ", ".join(map(str, paths)) or "nothing"
         reason = f" ({notes[0].removesuffix('.')})" if notes else ""
         raise InputError(f"There is no run in {where}{reason}; give folders that pcil train made.")
-    dots.sort(key=place)
-    for name, seeds in curves(points).items():
+    transitions.sort(key=place)
+    for name, seeds in curves(rows).items():
         if not len(matrix(seeds)[0]):
             first = seeds[0][0].seed
             notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {first} is shown.")
-            points[:] = [point for point in points if point[:3] != name or point.seed == first]
-    return found._replace(points=list({point[:5]: point for point in sorted(points, key=place)}.values()))
+            rows[:] = [row for row in rows if row[:3] != name or row.seed == first]
+    return found._replace(rows=list({row[:5]: row for row in sorted(rows, key=place)}.values()))
 
 
 def left_out(where: Path, reason: Any) -> str:
@@ -156,7 +156,7 @@ def named(where: Path, reason: Any) -> str:
     return text if text.startswith(folder) else f"{folder}, {text}"
 
 
-def place(row: Point | Dot) -> tuple[Any, ...]:
+def place(row: EvalRow | TransitionRow) -> tuple[Any, ...]:
     """Where a row stands among others: by task, method (the paper's first), variant, seed and frames."""
     return (row.task, row.method != "pcil", *row[1:5])
 
@@ -175,14 +175,14 @@ def label(name: tuple[str, str], names: Iterable[tuple[str, str]]) -> str:
     return name[0] if alone and name[1] == "default" else ", ".join(name)
 
 
-def matrix(runs: Sequence[Sequence[Point]], value: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
+def matrix(runs: Sequence[Sequence[EvalRow]], value: str = "return_mean") -> tuple[np.ndarray, np.ndarray]:
     """The frames `[F]` at which every seed has the value, and the values `[seeds, F]`."""
     tables = [{p.frames: getattr(p, value) for p in run if getattr(p, value) is not None} for run in runs]
     frames = sorted(set.intersection(*(set(table) for table in tables)))
     return np.array(frames, np.int64), np.array([[table[f] for f in frames] for table in tables], np.float64)
 
 
-def read_run(folder: Path, variant: str | None = None) -> list[Point]:
+def read_run(folder: Path, variant: str | None = None) -> list[EvalRow]:
     """The evaluations of a run folder in the order of time. `InputError` where the folder holds no run."""
     try:
         return _read(folder, variant)[0]
@@ -190,7 +190,7 @@ def read_run(folder: Path, variant: str | None = None) -> list[Point]:
         raise InputError(f"{folder} holds no run that can be read ({error}); give folders that pcil train made.") from error
 
 
-def _read(folder: Path, variant: str | None = None) -> tuple[list[Point], dict[str, Any], bool]:
+def _read(folder: Path, variant: str | None = None) -> tuple[list[EvalRow], dict[str, Any], bool]:
     """The evaluations of a run folder, its settings, and whether an evaluation was half written; raises what is among
     `UNREADABLE`."""
     about, (columns, torn), log = read_json(folder / "run.json"), _evaluations(folder), folder / "train.jsonl"
@@ -205,7 +205,7 @@ def _read(folder: Path, variant: str | None = None) -> tuple[list[Point], dict[s
     whole = read_text(log, LARGEST_FILE).split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line
     episodes = [episode for line in whole if "correlation" in (episode := parse_json(line))]
     ends = [(_part(e, "frames", int), _part(e, "correlation", int, float, NoneType)) for e in episodes]
-    points, before = [], -1.0
+    rows, before = [], -1.0
     if np.any(columns["frames"] % 1) or np.any(np.diff(columns["frames"]) < 0):
         raise ValueError("the frames in eval.csv are no whole numbers that grow")
     for frames in dict.fromkeys(columns["frames"].tolist()):
@@ -213,11 +213,11 @@ def _read(folder: Path, variant: str | None = None) -> tuple[list[Point], dict[s
         mean, low, high = (round(float(f(returns)), 2) for f in (np.mean, np.min, np.max))
         fresh = [correlation for end, correlation in ends if before < end <= frames and correlation]  # null, or 0 in older
         health = round(float(np.mean(fresh)), 4) if fresh else None  # logs, where one of the two does not vary
-        points.append(_checked(Point(*head, int(frames), mean, low, high, *tail, float(seconds[0]), health)))
+        rows.append(_checked(EvalRow(*head, int(frames), mean, low, high, *tail, float(seconds[0]), health)))
         before = frames
-    if not points:
+    if not rows:
         raise ValueError("it has no evaluation yet")
-    return points, run, torn
+    return rows, run, torn
 
 
 def _part(table: Any, name: str, *kinds: type) -> Any:
@@ -245,7 +245,7 @@ def _checked(row: Row) -> Row:
 
 
 @functools.cache
-def _hints(kind: type[Point] | type[Dot]) -> dict[str, Any]:
+def _hints(kind: type[EvalRow] | type[TransitionRow]) -> dict[str, Any]:
     return get_type_hints(kind)
 
 
@@ -286,8 +286,8 @@ def plain(text: str) -> str:
     return f"'{text}" if re.match(r"'*[=+\-@\t\r]", text) else text
 
 
-def write_points(path: Path, rows: Sequence[Point] | Sequence[Dot]) -> None:
-    """One header and a row a point or a dot; the whole file or, without rows, nothing and `InputError`."""
+def write_rows(path: Path, rows: Sequence[EvalRow] | Sequence[TransitionRow]) -> None:
+    """One header and one line for each row; the whole file or, without rows, nothing and `InputError`."""
     if not rows:
         raise InputError(f"There are no rows to write to {path}; it stays as it is.")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -299,11 +299,11 @@ def write_points(path: Path, rows: Sequence[Point] | Sequence[Dot]) -> None:
     partial.replace(path)
 
 
-def read_points(path: Path) -> list[Any]:
-    """The `Point`s or `Dot`s that `write_points` wrote; columns that a file of an older version lacks are None."""
+def read_rows(path: Path) -> list[Any]:
+    """The `EvalRow`s or `TransitionRow`s that `write_rows` wrote; columns that a file of an older version lacks are None."""
     try:
         table = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_FILE))))
-        kind: Any = Dot if table and "silhouette" in table[0] else Point
+        kind: Any = TransitionRow if table and "silhouette" in table[0] else EvalRow
         parse = {name: _PARSERS[hint] for name, hint in _hints(kind).items()}
         columns = set(table[0]) if table else set(parse)
         if wrong := (columns - set(parse)) or (set(parse) - columns - set(kind._field_defaults)):
@@ -311,8 +311,8 @@ def read_points(path: Path) -> list[Any]:
                 f"{shown(str(min(wrong, key=str)), 100)} is {'missing' if wrong <= set(parse) else 'no column of it'}"
             )
         rows = [_checked(kind(**{name: parse[name](value) for name, value in row.items()})) for row in table]
-        for runs in curves(row for row in rows if isinstance(row, Dot)).values():
-            if any(len({dot.reward is None for dot in run}) < 2 for run in runs):
+        for runs in curves(row for row in rows if isinstance(row, TransitionRow)).values():
+            if any(len({row.reward is None for row in run}) < 2 for run in runs):
                 raise ValueError("it has a run without transitions of expert and agent")
         return rows
     except UNREADABLE as error:

@@ -11,7 +11,7 @@ from jinja2 import Environment
 
 from pcil.errors import InputError, shown
 from pcil.report import figures, tables
-from pcil.report.load import Collection, write_points
+from pcil.report.load import Collection, write_rows
 
 TITLE = "<title>pcil report"
 """By which a page is known as ours."""
@@ -43,16 +43,16 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     written = {name: table for name, make in tables.MAKERS.items() if (table := make(found)).rows}
     for name, table in written.items():
         tables.write(name, table, out / "tables")
-    write_points(out / "tables" / "evaluations.csv", found.points)
-    if found.dots:
-        write_points(out / "tables" / "transitions.csv", found.dots)
+    write_rows(out / "tables" / "evaluations.csv", found.rows)
+    if found.transitions:
+        write_rows(out / "tables" / "transitions.csv", found.transitions)
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"cell": tables.cell, "shown": lambda value: shown(str(value), 500)}
     page = environment.from_string(Path(__file__).with_name("page.html").read_text()).render(
-        tasks=list(dict.fromkeys(point.task for point in found.points)),
-        methods=list(dict.fromkeys(point.method for point in found.points)),
+        tasks=list(dict.fromkeys(row.task for row in found.rows)),
+        methods=list(dict.fromkeys(row.method for row in found.rows)),
         found=found,
-        last={point[:4]: point for point in found.points},
+        last={row[:4]: row for row in found.rows},
         tables=[(name, *tables.words(tables.MAKERS[name]), table) for name, table in written.items()],
         figures=draw(found, out / "figures"),
         films={title: _uri("webp", film) for title, film in films.items()},
@@ -63,21 +63,21 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
 
 def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
     """Every figure into `folder`; for the page, by heading and then by title, as data URIs."""
-    points, looks = found.points, figures.styles(found.points)
-    files = _file_names([row.task for row in (*points, *found.dots)])
+    rows, looks = found.rows, figures.styles(found.rows)
+    files = _file_names([row.task for row in (*rows, *found.transitions)])
     svg: dict[str, dict[str, str]] = {"Learning curves": {}}
-    figures.grid(points, folder / "curves", looks=looks)  # all tasks on one sheet, as papers print it
-    for task in dict.fromkeys(point.task for point in points):
+    figures.grid(rows, folder / "curves", looks=looks)  # all tasks on one sheet, as papers print it
+    for task in dict.fromkeys(row.task for row in rows):
         path = folder / f"curves-{files[task]}"
-        svg["Learning curves"][task] = figures.grid([p for p in points if p.task == task], path, looks=looks)
-    if together := figures.aggregate(points, folder / "aggregate", looks):
+        svg["Learning curves"][task] = figures.grid([row for row in rows if row.task == task], path, looks=looks)
+    if together := figures.aggregate(rows, folder / "aggregate", looks):
         svg["Learning curves"]["all tasks"] = together
-    if any(point.correlation is not None for point in points):
-        svg["Reward health"] = {"all": figures.grid(points, folder / "health", value="correlation", looks=looks)}
-    if found.dots:
-        figures.clouds(found.dots, folder / "representation")
-    for task in dict.fromkeys(dot.task for dot in found.dots):
-        path, mine = folder / f"representation-{files[task]}", [dot for dot in found.dots if dot.task == task]
+    if any(row.correlation is not None for row in rows):
+        svg["Reward health"] = {"all": figures.grid(rows, folder / "health", value="correlation", looks=looks)}
+    if found.transitions:
+        figures.clouds(found.transitions, folder / "representation")
+    for task in dict.fromkeys(row.task for row in found.transitions):
+        path, mine = folder / f"representation-{files[task]}", [row for row in found.transitions if row.task == task]
         svg.setdefault("t-SNE", {})[task] = figures.clouds(mine, path, columns=2)
     return {heading: {title: _uri("svg+xml", t.encode()) for title, t in drawn.items()} for heading, drawn in svg.items()}
 

@@ -13,7 +13,7 @@ import numpy as np
 from pcil import compilation, envs, modules, seeds
 from pcil.errors import WHOLE, InputError
 from pcil.report.embedding import project
-from pcil.report.load import Collection, Dot, Point, Source, flat, named, place
+from pcil.report.load import Collection, EvalRow, Source, TransitionRow, flat, named, place
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.training import learner, loop, presets, runs
@@ -27,7 +27,7 @@ NUMBERS = 2**28
 
 
 def add(found: Collection, trust: Sequence[str] = ()) -> None:
-    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not.
+    """Rows of every run that has a representation into `found.transitions`, and a note of those that should have and have not.
 
     `trust` are the modules that the runs' files may name.
     """
@@ -38,17 +38,17 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         return
     refused: list[str] = []
     for name, source in found.sources.items():
-        last = [point for point in found.points if point[:4] == name][-1]
+        last = [row for row in found.rows if row[:4] == name][-1]
         try:
-            found.dots.extend(transitions(source, last, trust))
+            found.transitions.extend(transitions(source, last, trust))
         except Exception as error:  # whatever a damaged folder or somebody's environment raises
             refused.append(named(source.folder, error))
-    found.dots.sort(key=place)
+    found.transitions.sort(key=place)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
 
 
-def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[Dot]:
+def transitions(source: Source, row: EvalRow, trust: Sequence[str] = ()) -> list[TransitionRow]:
     """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
 
     Empty where the run's reward has no representation; `InputError` where it can't be restored.

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from pcil.report.load import Point
+from pcil.report.load import EvalRow
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -81,13 +81,13 @@ def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tu
     return np.asarray(low), np.asarray(high)
 
 
-def share_of_expert(runs: Sequence[Sequence[Point]], scores: np.ndarray) -> np.ndarray | None:
+def share_of_expert(runs: Sequence[Sequence[EvalRow]], scores: np.ndarray) -> np.ndarray | None:
     """Scores, one row a run, in units of the demonstrations' return; None where that is unknown or not positive."""
     experts = np.array([run[-1].expert_return or 0 for run in runs])
     return None if experts.min() <= 0 else (scores.T / experts).T
 
 
-def first_reach(run: Sequence[Point], share: float) -> Point | None:
+def first_reach(run: Sequence[EvalRow], share: float) -> EvalRow | None:
     """The first evaluation at which a run has this share of its expert's return, if there is one."""
-    reached = (point for point in run if point.return_mean >= share * (point.expert_return or math.inf) > 0)
+    reached = (row for row in run if row.return_mean >= share * (row.expert_return or math.inf) > 0)
     return next(reached, None)

@@ -15,7 +15,7 @@ import numpy as np
 from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import OFFLINE, Collection, Point, curves, label, matrix, plain
+from pcil.report.load import OFFLINE, Collection, EvalRow, curves, label, matrix, plain
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -45,7 +45,7 @@ def finals(found: Collection) -> Table:
     mean, and a bootstrap of three is too narrow.
     """
     rows = []
-    for name, runs in curves(found.points).items():
+    for name, runs in curves(found.rows).items():
         frames, final = _final(runs)
         share = stats.share_of_expert(runs, final)
         spread = float(np.std(final, ddof=1)) if len(final) > 1 else None
@@ -62,7 +62,7 @@ def overview(found: Collection) -> Table:
     goes down.
     """
     means, experts, lengths = {}, {}, {}
-    for (task, *name), runs in curves(found.points).items():
+    for (task, *name), runs in curves(found.rows).items():
         frames, final = _final(runs)
         means[task, tuple(name)] = stats.mean_interval(final)
         lengths[task, tuple(name)] = 0 if name[0] in OFFLINE else frames
@@ -85,7 +85,7 @@ def paper(found: Collection) -> Table:
     say, the interval is 1.22 times as wide. Mind the frames of ours.
     """
     rows = []
-    for (task, method, variant), runs in curves(found.points).items():
+    for (task, method, variant), runs in curves(found.rows).items():
         if task in PAPER_TASKS and method in PAPER:
             frames, final = _final(runs)
             published = stats.student(*PAPER[method][PAPER_TASKS.index(task)], PAPER_SEEDS)
@@ -103,7 +103,7 @@ def aggregate(found: Collection) -> Table:
     the same frames.
     """
     rows = []
-    for name, tasks in _by_method(found.points).items():
+    for name, tasks in _by_method(found.rows).items():
         shares = (stats.share_of_expert(runs, _final(runs)[1]) for runs in tasks.values())
         if not (scores := [share for share in shares if share is not None]):
             continue
@@ -121,15 +121,15 @@ def efficiency(found: Collection) -> Table:
     where it shared one. Methods that take no step in the environment are left out.
     """
     rows = []
-    for name, runs in curves(point for point in found.points if point.method not in OFFLINE).items():
-        row: list[Any] = [*name]
+    for name, runs in curves(row for row in found.rows if row.method not in OFFLINE).items():
+        cells: list[Any] = [*name]
         for reached in ([stats.first_reach(run, share) for run in runs] for share in SHARES):
-            frames = np.median([point.frames if point else math.inf for point in reached])
-            minutes = np.median([(point.seconds or math.nan) / 60 if point else math.inf for point in reached])
-            row += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
-            row.append(sum(point is not None for point in reached))
+            frames = np.median([row.frames if row else math.inf for row in reached])
+            minutes = np.median([(row.seconds or math.nan) / 60 if row else math.inf for row in reached])
+            cells += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
+            cells.append(sum(row is not None for row in reached))
         if stats.share_of_expert(runs, np.zeros(len(runs))) is not None:
-            rows.append((*row, len(runs), _final(runs)[0]))
+            rows.append((*cells, len(runs), _final(runs)[0]))
     words = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
     return Table((*KEY, *words, "seeds", "frames"), rows)
 
@@ -141,7 +141,7 @@ def improvement(found: Collection) -> Table:
     tie being half; the mean over the tasks that both have, with a bootstrap interval.
     """
     rows = []
-    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points).items(), 2):
+    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.rows).items(), 2):
         both = (_at_the_same_frames(x[task], y[task]) for task in x if task in y)
         if pairs := [pair for pair in both if pair]:
             chance = stats.probability_of_improvement(*zip(*pairs, strict=True))
@@ -156,7 +156,7 @@ def health(found: Collection) -> Table:
     has 1.
     """
     rows = []
-    for name, runs in curves(found.points).items():
+    for name, runs in curves(found.rows).items():
         frames, correlation = matrix(runs, "correlation")
         if len(frames) > 1:
             halves = np.array_split(correlation, 2, axis=1)
@@ -172,10 +172,10 @@ def representation(found: Collection) -> Table:
     apart from the agent, and 0 or less where they are scattered among its transitions.
     """
     rows = []
-    for name, seeds in curves(found.dots).items():
+    for name, seeds in curves(found.transitions).items():
         columns: list[Any] = []
         for values in zip(*map(measures, seeds), strict=True):
-            each = ", ".join(f"{dots[0].seed}: {value:.2f}" for dots, value in zip(seeds, values, strict=True))
+            each = ", ".join(f"{run[0].seed}: {value:.2f}" for run, value in zip(seeds, values, strict=True))
             columns += [stats.mean_interval(values), each]
         rows.append((*name, *columns))
     return Table((*KEY, "Spearman", "Spearman of each seed", "silhouette", "silhouette of each seed"), rows)
@@ -227,13 +227,13 @@ def write(name: str, table: Table, folder: Path) -> None:
             rows.writerow([round(value, 6) if isinstance(value, float) else value for value in cells])
 
 
-def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:
+def _final(runs: Sequence[Sequence[EvalRow]]) -> tuple[int, np.ndarray]:
     """The last frames at which every seed was evaluated, and the returns `[seeds]` there."""
     frames, returns = matrix(runs)
     return int(frames[-1]), returns[:, -1]
 
 
-def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.ndarray, np.ndarray] | None:
+def _at_the_same_frames(x: list[list[EvalRow]], y: list[list[EvalRow]]) -> tuple[np.ndarray, np.ndarray] | None:
     """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline, and
     None where they have no evaluation in common."""
     if {x[0][0].method, y[0][0].method} & set(OFFLINE):
@@ -244,10 +244,10 @@ def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.
     return last[: len(x)], last[len(x) :]
 
 
-def _by_method(points: Sequence[Point]) -> dict[Any, dict[str, list[list[Point]]]]:
+def _by_method(rows: Sequence[EvalRow]) -> dict[Any, dict[str, list[list[EvalRow]]]]:
     """The seeds' rows by method and variant, then by task."""
-    found: dict[Any, dict[str, list[list[Point]]]] = {}
-    for (task, *name), runs in curves(points).items():
+    found: dict[Any, dict[str, list[list[EvalRow]]]] = {}
+    for (task, *name), runs in curves(rows).items():
         found.setdefault(tuple(name), {})[task] = runs
     return found
 

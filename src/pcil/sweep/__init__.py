@@ -51,7 +51,7 @@ def sweep(plan: Plan, out: Path, limit: int | None, address: str | None, console
                 if text:
                     say(text)
                 speed = (sum(job.frames for job in plan.jobs) - before) / (time.monotonic() - began)
-                live.update(picture(plan.jobs, speed, screen.height - 4), refresh=True)
+                live.update(progress_table(plan.jobs, speed, screen.height - 4), refresh=True)
     if signals.number:
         say("Stopped; every run is saved, and the same command goes on from here.")
         return 128 + signals.number
@@ -127,7 +127,7 @@ def _appears(file: Path) -> bool:
     return file.exists()
 
 
-def picture(jobs: list[Job], speed: float, room: int) -> Group:
+def progress_table(jobs: list[Job], speed: float, room: int) -> Group:
     """A row a run and one bar over all; where there is no room for every row, those of running runs come first."""
     table = Table("run", "task", "method", "seed", "", "frames", "return", "frames/s", "time left", box=None)
     for job in jobs if len(jobs) <= room else sorted(jobs, key=lambda job: job.state != "running")[: max(room, 1)]:

@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from pcil.report.load import flat, place, read_rows, read_run, write_rows
+from pcil.report.load import flat, read_rows, read_run, sort_key, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training import presets
 from pcil.training.config import renamed
@@ -25,7 +25,7 @@ def main(target: str, *folders: str) -> None:
         rows += read_run(folder, ", ".join([run["preset"], *told]))
     new = {row[:4] for row in rows}
     kept = [row for row in read_rows(Path(target)) if row[:4] not in new] if Path(target).exists() else []
-    write_rows(Path(target), sorted(kept + rows, key=place))
+    write_rows(Path(target), sorted(kept + rows, key=sort_key))
 
 
 main(*sys.argv[1:])

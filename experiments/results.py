@@ -39,7 +39,7 @@ def main(words: list[str]) -> int:
         return int(stale > 0)
     for file in sorted((ROOT / "results").iterdir()):
         found, path = results(file.stem), ROOT / "docs" / "figures" / file.stem
-        _ = figures.clouds(found.transitions, path) if found.transitions else figures.grid(found.rows, path)
+        _ = figures.scatter_grid(found.transitions, path) if found.transitions else figures.grid(found.rows, path)
         print(path.relative_to(ROOT))
     return 0
 

@@ -213,13 +213,13 @@ def luminance(colour: str) -> float:
 
 
 def test_every_method_has_a_look_and_can_be_told_without_colour() -> None:
-    looks = [*figures.STYLES.values(), *figures.OTHERS]
+    looks = [*figures.STYLES.values(), *figures.SPARE_STYLES]
     assert set(figures.STYLES) >= set(presets.METHODS) | {"pwil", "sil", "tcn", "pcil-gail", "tcn-gail", "potil"}
     assert len({look.marker for look in looks}) == len({look.colour for look in looks}) == len(looks)
     assert len({look.dashes for look in figures.STYLES.values()}) == len(figures.STYLES)
 
 
-@pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.OTHERS)])
+@pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.SPARE_STYLES)])
 def test_lines_stand_out_from_the_paper(colour: str) -> None:
     assert 1.05 / (luminance(colour) + 0.05) > 3, "WCAG's least contrast of graphical objects"
 
@@ -248,7 +248,7 @@ def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes])
     transitions = make_transitions("a", "dac", 1, 10) + make_transitions("a", "dac", 2, 50)
     transitions += make_transitions("a", "pcil", 1, 20) + make_transitions("b", "pcil", 1, 30)
     transitions += [TransitionRow("a", "pcil", "default", 1, 5000, 5.0, 1.0, 0.5, 20.0, 9.0)]
-    figures.clouds(transitions, tmp_path / "clouds")
+    figures.scatter_grid(transitions, tmp_path / "clouds")
     panels = [axes for axes in drawn if axes.get_title()]
     assert [axes.get_title().split(",")[:2] for axes in panels] == [["a", " dac"], ["a", " pcil"], ["b", " pcil"]]
     (agent,), (expert,) = panels[0].collections, panels[0].lines

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import io
+import itertools
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence, Sized
@@ -37,6 +39,12 @@ class Style(NamedTuple):
     marker: str
     dashes: tuple[float, ...] = ()
 
+    @property
+    def line(self) -> dict[str, Any]:
+        """Matplotlib's options of a line."""
+        linestyle = (0, self.dashes) if self.dashes else "-"
+        return {"color": self.colour, "linestyle": linestyle, "linewidth": 1.8, "marker": self.marker, "markersize": 5}
+
 
 STYLES = {
     "pcil": Style("#a60628", "o"),  # colours of the first five and of the expert: the paper's legend, Figure 3
@@ -50,7 +58,7 @@ STYLES = {
     "tcn-gail": Style("#5b4636", ">", (1, 2)),
     "expert": Style(GREY, "*", (3, 1, 1, 1)),
 }
-OTHERS = [
+SPARE_STYLES = [
     Style(INK, "p"),
     Style("#0000c8", "h", (5, 2)),
     Style("#7f7f00", "d", (3, 2)),
@@ -67,7 +75,7 @@ OTHERS = [
 """Methods that are not ours, in the order of their names; and variants of a method after its first."""
 
 
-def words(text: str) -> str:
+def escape_label(text: str) -> str:
     """A name as a figure shows it: short, and its dollar signs begin no formula."""
     return shown(text, 70).replace("$", "\\$")
 
@@ -75,14 +83,10 @@ def words(text: str) -> str:
 def styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, str], Style]:
     """A look for each method and variant: the method's own, and another one for each further variant of it."""
     found: dict[tuple[str, str], Style] = {}
-    spare = 0
-    order = {method: place for place, method in enumerate(STYLES)}
+    order, spare = {method: place for place, method in enumerate(STYLES)}, itertools.cycle(SPARE_STYLES)
     for method, variant in sorted({row[1:3] for row in rows}, key=lambda name: (order.get(name[0], len(order)), name)):
-        if method in STYLES and method not in {name for name, _ in found}:
-            found[method, variant] = STYLES[method]
-        else:
-            found[method, variant] = OTHERS[spare % len(OTHERS)]
-            spare += 1
+        own = method in STYLES and method not in {name for name, _ in found}
+        found[method, variant] = STYLES[method] if own else next(spare)
     return found
 
 
@@ -93,13 +97,13 @@ def run_curve(folder: Path, expert_return: float | None) -> Path:
     frames = [row.frames for row in rows]
     figure, axis = plt.subplots(figsize=(7, 4), layout="constrained")
     low, high = [row.return_low for row in rows], [row.return_high for row in rows]
-    colour = STYLES.get(method, OTHERS[0]).colour
+    colour = STYLES.get(method, SPARE_STYLES[0]).colour
     axis.fill_between(frames, low, high, color=colour, alpha=0.18, linewidth=0, label="lowest to highest episode")
     axis.plot(frames, [row.return_mean for row in rows], color=colour, marker="o", markersize=3, label="mean")
     drawn = low + high
     if expert_return is not None:
-        drawn.append(_expert(axis, expert_return))
-    _finish(axis, words(f"{task} - {method} ({preset}, seed {seed})"), "return", drawn)
+        drawn.append(_expert_line(axis, expert_return))
+    _label_axes(axis, escape_label(f"{task} - {method} ({preset}, seed {seed})"), "return", drawn)
     axis.legend(frameon=False, fontsize=8)
     path = folder / "curve.png"
     _write(figure, path, dpi=150)
@@ -127,15 +131,16 @@ def grid(
         mine = curves(row for row in rows if row.task == task)
         drawn = [getattr(row, value) for runs in mine.values() for run in runs for row in run]
         for name in (name for name in looks if (task, *name) in mine):
+            runs, look = mine[task, *name], (looks[name], escape_label(label(name, looks)))
             if name[0] in OFFLINE:
-                _level(axis, matrix(mine[task, *name], value)[1][:, -1].mean(), looks[name], words(label(name, looks)))
+                _level_line(axis, matrix(runs, value)[1][:, -1].mean(), *look)
             else:
-                _seeds(axis, mine[task, *name], value, looks[name], words(label(name, looks)))
+                _seed_lines(axis, runs, value, *look)
         if value == "return_mean":
             experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
-            drawn += [_expert(axis, expert) for expert in experts if expert is not None]
+            drawn += [_expert_line(axis, expert) for expert in experts if expert is not None]
         ylabel = {"return_mean": "return", "correlation": "correlation with true reward"}[value]
-        _finish(axis, f"{words(task)}, {_span('seed', mine)}", ylabel, drawn)
+        _label_axes(axis, f"{escape_label(task)}, {_count('seed', mine)}", ylabel, drawn)
     return save(figure, path)
 
 
@@ -156,22 +161,22 @@ def aggregate(rows: Sequence[EvalRow], path: Path, looks: dict[tuple[str, str], 
     drawn = [1.0]
     for name in (name for name in looks if name in strata):
         tasks = strata[name]
-        frames = np.array(sorted(set.intersection(*(set(own.tolist()) for own, _ in tasks))))
+        frames = functools.reduce(np.intersect1d, [own for own, _ in tasks])
         scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        middle, named = stats.iqm(*scores), words(label(name, looks))
+        center, text = stats.iqm(*scores), escape_label(label(name, looks))
         if len({len(tasks) for tasks in strata.values()}) > 1:
-            named += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
+            text += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
         if name[0] in OFFLINE:
-            _level(axis, middle[-1], looks[name], named)
+            _level_line(axis, center[-1], looks[name], text)
         else:
-            _line(axis, frames, middle, stats.bootstrap(stats.iqm, scores), looks[name], named)
-        drawn += middle.tolist()
-    _expert(axis, 1.0)
-    _finish(axis, _span("task", strata), "share of expert (IQM)", drawn)
+            _band_line(axis, frames, center, stats.bootstrap(stats.iqm, scores), looks[name], text)
+        drawn += center.tolist()
+    _expert_line(axis, 1.0)
+    _label_axes(axis, _count("task", strata), "share of expert (IQM)", drawn)
     return save(figure, path)
 
 
-def clouds(transitions: Sequence[TransitionRow], path: Path, columns: int | None = None) -> str:
+def scatter_grid(transitions: Sequence[TransitionRow], path: Path, columns: int | None = None) -> str:
     """t-SNE of each method's representation: the first seed's transitions; by default a row a method and a column a task."""
     first: dict[tuple[str, ...], list[TransitionRow]] = {name: seeds[0] for name, seeds in curves(transitions).items()}
     tasks, methods = (list(dict.fromkeys(name[part] for name in first)) for part in (slice(1), slice(1, 3)))
@@ -180,7 +185,7 @@ def clouds(transitions: Sequence[TransitionRow], path: Path, columns: int | None
         if name in first:
             drawn = [row for other, own in first.items() if other[0] == name[0] for row in own]
             rewards = [row.reward for row in drawn if row.reward is not None]
-            _cloud(axis, first[name], (min(rewards), max(rewards)))
+            _scatter(axis, first[name], min(rewards), max(rewards))
         else:
             axis.axis("off")
     return save(figure, path)
@@ -195,8 +200,7 @@ def save(figure: Figure, path: Path) -> str:
         fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of the words and of a line
         columns = max(min(fitting, len(lines)), 1)
         figure.set_figheight(figure.get_figheight() + LEGEND_ROW * (-(-len(lines) // columns) - 1))
-        look = {"ncols": columns, "frameon": False, "fontsize": 8}
-        figure.legend(lines.values(), lines, loc="outside lower center", **look)
+        figure.legend(lines.values(), lines, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
     _write(figure, path.with_suffix(".png"), dpi=130)
     _write(figure, path.with_suffix(".pdf"), metadata={"CreationDate": None})
     text = io.StringIO()
@@ -215,61 +219,55 @@ def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> 
     """A figure with so many panels; what is left of the last row is empty."""
     columns = min(columns, panels)
     rows = -(-panels // columns)
-    options = {"layout": "constrained", "squeeze": False}
-    figure, axes = plt.subplots(rows, columns, figsize=(size[0] * columns, size[1] * rows), **options)
+    figsize = size[0] * columns, size[1] * rows
+    figure, axes = plt.subplots(rows, columns, figsize=figsize, layout="constrained", squeeze=False)
     for axis in axes.flat[panels:]:
         axis.axis("off")
     return figure, list(axes.flat)[:panels]
 
 
-def _seeds(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style: Style, name: str) -> None:
+def _seed_lines(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style: Style, name: str) -> None:
     """Each seed's return as a thin line, and their mean with its interval at the frames that all of them have."""
     for run in runs if value == "return_mean" else ():
         axis.plot([p.frames for p in run], [getattr(p, value) for p in run], color=style.colour, alpha=0.35, linewidth=0.7)
     frames, values = matrix(runs, value)
     if len(frames):
-        middle = [stats.mean_interval(column) for column in values.T]
-        ends = np.array([(interval.low, interval.high) for interval in middle]).T
-        _line(axis, frames, np.array([interval.value for interval in middle]), ends, style, name)
+        center, *bounds = np.array([stats.mean_interval(column) for column in values.T]).T
+        _band_line(axis, frames, center, bounds, style, name)
 
 
-def _level(axis: Axes, value: float, style: Style, label: str) -> None:
-    """A method that takes no step in the environment: one number, whatever the frames."""
-    look = {"color": style.colour, "linestyle": (0, style.dashes) if style.dashes else "-", "marker": style.marker}
-    axis.axhline(value, linewidth=1.8, markersize=5, label=label, **look)
+def _level_line(axis: Axes, value: float, style: Style, label: str) -> None:
+    """The line of a method that takes no step in the environment: one return at all frames."""
+    axis.axhline(value, label=label, **style.line)
 
 
-def _line(
-    axis: Axes, frames: np.ndarray, middle: np.ndarray, ends: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
+def _band_line(
+    axis: Axes, frames: np.ndarray, center: np.ndarray, bounds: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
 ) -> None:
-    """One method: its line with a few markers, in a band where there is one."""
-    if np.isfinite(ends[0]).all():
-        axis.fill_between(frames, ends[0], ends[1], color=style.colour, alpha=0.15, linewidth=0)
-    every = max(len(frames) // 6, 1)
-    dashes = (0, style.dashes) if style.dashes else "-"
-    look = {"color": style.colour, "linestyle": dashes, "marker": style.marker, "markersize": 5, "markevery": every}
-    axis.plot(frames, middle, linewidth=1.8, label=label, **look)
+    """A method's line with a few markers, and the band between the bounds where they are known."""
+    if np.isfinite(bounds[0]).all():
+        axis.fill_between(frames, bounds[0], bounds[1], color=style.colour, alpha=0.15, linewidth=0)
+    axis.plot(frames, center, label=label, markevery=max(len(frames) // 6, 1), **style.line)
 
 
-def _cloud(axis: Axes, transitions: Sequence[TransitionRow], ends: tuple[float, float]) -> None:
-    """The agent's transitions coloured by reward, the expert's above them in blue; `ends` are those of the colours, which all
-    methods share on a task."""
-    expert, agent = ([row for row in transitions if (row.reward is None) == own] for own in (True, False))
-    shared = {"s": 12, "linewidths": 0, "rasterized": True}
-    rewards = np.array([row.reward for row in agent], np.float64)
-    shared |= {"cmap": REWARD_COLOURS, "vmin": ends[0], "vmax": ends[1]}
-    seen = axis.scatter([row.x for row in agent], [row.y for row in agent], c=rewards, **shared)
-    look = {"color": BLUE, "markersize": 3.5, "markeredgewidth": 0, "linestyle": "", "rasterized": True}
-    axis.plot([row.x for row in expert], [row.y for row in expert], marker="^", label="expert", **look)
-    bar = axis.figure.colorbar(seen, ax=axis, label="true reward of an agent step", shrink=0.8)
+def _scatter(axis: Axes, rows: Sequence[TransitionRow], low: float, high: float) -> None:
+    """The agent's transitions coloured by reward, from `low` to `high` on all panels of a task, and the expert's in blue."""
+    expert, agent = ([row for row in rows if (row.reward is None) == of_expert] for of_expert in (True, False))
+    colours: dict[str, Any] = {"c": [row.reward for row in agent], "cmap": REWARD_COLOURS, "vmin": low, "vmax": high}
+    places = [row.x for row in agent], [row.y for row in agent]
+    image = axis.scatter(*places, s=12, linewidths=0, rasterized=True, **colours)
+    look: dict[str, Any] = {"color": BLUE, "marker": "^", "markersize": 3.5, "markeredgewidth": 0, "linestyle": ""}
+    axis.plot([row.x for row in expert], [row.y for row in expert], label="expert", rasterized=True, **look)
+    bar = axis.figure.colorbar(image, ax=axis, label="true reward of an agent step", shrink=0.8)
     assert bar.solids is not None
     bar.solids.set_rasterized(True)
+    task, method, variant, seed, frames = rows[0][:5]
+    title = f"{escape_label(f'{task}, {method}, {variant}')}\nseed {seed}, {frames:,} frames"
     axis.set(xticks=[], yticks=[])
-    task, method, variant, seed, frames = transitions[0][:5]
-    axis.set_title(f"{words(f'{task}, {method}, {variant}')}\nseed {seed}, {frames:,} frames", fontsize=8)
+    axis.set_title(title, fontsize=8)
 
 
-def _expert(axis: Axes, value: float) -> float:
+def _expert_line(axis: Axes, value: float) -> float:
     """A line at what the expert has, with its number at the right end; returns the value."""
     axis.axhline(value, color=GREY, linestyle="--", linewidth=1, label="demos")
     where = {"xycoords": ("axes fraction", "data"), "xytext": (4, 0), "textcoords": "offset points"}
@@ -277,13 +275,13 @@ def _expert(axis: Axes, value: float) -> float:
     return value
 
 
-def _span(word: str, groups: Mapping[Any, Sized]) -> str:
+def _count(word: str, groups: Mapping[Any, Sized]) -> str:
     """How many of something the groups have, such as "2 to 3 seeds"."""
     counts = sorted({len(group) for group in groups.values()})
     return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
 
 
-def _finish(axis: Axes, title: str, ylabel: str, drawn: Sequence[float]) -> None:
+def _label_axes(axis: Axes, title: str, ylabel: str, drawn: Sequence[float]) -> None:
     """Words, and limits that hold every value of `drawn`; a wide band may reach beyond them."""
     low, high = min(drawn), max(drawn)
     room = 0.08 * (high - low) or 1

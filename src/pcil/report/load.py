@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import functools
 import io
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -15,13 +14,13 @@ import numpy as np
 
 from pcil.errors import InputError, brief, shown
 from pcil.files import parse_json, read_json, read_text
-from pcil.report.variants import LONGEST, variants
+from pcil.report.variants import MAX_NAME_LENGTH, variants
 
 OFFLINE = ("bc",)
 """Methods that take no step in the environment; their frames only count updates, two frames each where actions are repeated."""
-LARGEST = 1e50
+MAX_MAGNITUDE = 1e50
 """Magnitude of a number, whose square is finite too."""
-LARGEST_FILE = 2**28
+MAX_FILE_BYTES = 2**28
 """Bytes of a log or a file of results."""
 UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError, csv.Error)
 """What reading a damaged file may raise."""
@@ -71,6 +70,8 @@ class TransitionRow(NamedTuple):
 
 
 Row = TypeVar("Row", EvalRow, TransitionRow)
+COLUMNS: dict[type, dict[str, Any]] = {kind: get_type_hints(kind) for kind in (EvalRow, TransitionRow)}
+"""The name and type of each column of a file of results."""
 
 
 class Source(NamedTuple):
@@ -93,13 +94,13 @@ class Collection(NamedTuple):
 
 
 def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str, Any]] = dict) -> Collection:
-    """Runs at any depth below folders, and the rows of CSV files; `InputError` where not one run can be read.
+    """The runs at any depth below folders, and the rows of CSV files; `InputError` where no run can be read.
 
     `complete` adds to a run's settings those that are newer than the run.
     """
     rows, transitions, sources, notes = found = Collection([], [], {}, [])
     folders: dict[Path, Path] = {}
-    seen: dict[tuple[Any, ...], Path] = {}
+    first_file: dict[tuple[Any, ...], Path] = {}
     for path in paths:
         if not path.exists():
             raise InputError(f"{path} does not exist; give run folders, folders that hold some, or files like results/*.csv.")
@@ -108,39 +109,36 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
         except InputError as error:
             notes.append(left_out(path, error))
             continue
-        others = {seen.setdefault((type(row), *row[:4]), path) for row in added} - {path}
+        others = {first_file.setdefault((type(row), *row[:4]), path) for row in added} - {path}
         notes += (f"{path} holds runs that {other} has too; those of the latter are shown." for other in sorted(others))
-        added = [row for row in added if seen[type(row), *row[:4]] == path]
-        rows += (row for row in added if isinstance(row, EvalRow))
-        transitions += (row for row in added if isinstance(row, TransitionRow))
+        kept = (row for row in added if first_file[type(row), *row[:4]] == path)
+        (transitions if added and isinstance(added[0], TransitionRow) else rows).extend(kept)
         folders |= {file.parent.resolve(): file.parent for file in sorted(path.rglob("run.json"))}
-    runs = []
+    runs: list[tuple[list[EvalRow], Source]] = []
     for folder in folders.values():
         try:
-            run_rows, run, torn = _read(folder)
-            notes += [left_out(folder, "the end of eval.csv, whose last line is half written")] if torn else []
+            run_rows, run, truncated = _read(folder)
+            notes += [left_out(folder, "the end of eval.csv, whose last line is half written")] if truncated else []
             runs.append((run_rows, Source(folder, complete(flat(run)), (folder / "DONE").exists())))
         except UNREADABLE as error:
             notes.append(left_out(folder, error))
     for (run_rows, source), variant in zip(runs, variants([source.settings for _, source in runs]), strict=True):
         name = (*run_rows[0][:2], variant, run_rows[0].seed)
-        first = sources.setdefault(name, source)
-        if first is source:
-            rows[:] = [row for row in rows if row[:4] != name]
-            rows += (row._replace(variant=variant) for row in run_rows)
+        if (first := sources.setdefault(name, source)) is source:
+            rows[:] = [row for row in rows if row[:4] != name] + [row._replace(variant=variant) for row in run_rows]
         else:
             notes.append(f"{source.folder} holds the same run as {first.folder}, which is shown.")
     if not rows:
         where = ", ".join(map(str, paths)) or "nothing"
         reason = f" ({notes[0].removesuffix('.')})" if notes else ""
         raise InputError(f"There is no run in {where}{reason}; give folders that pcil train made.")
-    transitions.sort(key=place)
+    transitions.sort(key=sort_key)
     for name, seeds in curves(rows).items():
         if not len(matrix(seeds)[0]):
-            first = seeds[0][0].seed
-            notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {first} is shown.")
-            rows[:] = [row for row in rows if row[:3] != name or row.seed == first]
-    return found._replace(rows=list({row[:5]: row for row in sorted(rows, key=place)}.values()))
+            seed = seeds[0][0].seed
+            notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {seed} is shown.")
+            rows[:] = [row for row in rows if row[:3] != name or row.seed == seed]
+    return found._replace(rows=list({row[:5]: row for row in sorted(rows, key=sort_key)}.values()))
 
 
 def left_out(where: Path, reason: Any) -> str:
@@ -156,7 +154,7 @@ def named(where: Path, reason: Any) -> str:
     return text if text.startswith(folder) else f"{folder}, {text}"
 
 
-def place(row: EvalRow | TransitionRow) -> tuple[Any, ...]:
+def sort_key(row: EvalRow | TransitionRow) -> tuple[Any, ...]:
     """Where a row stands among others: by task, method (the paper's first), variant, seed and frames."""
     return (row.task, row.method != "pcil", *row[1:5])
 
@@ -195,16 +193,16 @@ def _read(folder: Path, variant: str | None = None) -> tuple[list[EvalRow], dict
     `UNREADABLE`."""
     about, (columns, torn), log = read_json(folder / "run.json"), _evaluations(folder), folder / "train.jsonl"
     run, demos, commit = (
-        _part(about, name, kind, NoneType) for name, kind in (("run", dict), ("demos", dict), ("commit", str))
+        _typed(about, name, kind, NoneType) for name, kind in (("run", dict), ("demos", dict), ("commit", str))
     )
-    names = {name: _part(run, name, str) for name in ("task", "method", "preset")}
-    seed, _ = _part(run, "seed", int), _part(run, "frames", int, NoneType)
-    expert = _part(demos or {}, "return_mean", int, float, NoneType)
+    names = {name: _typed(run, name, str) for name in ("task", "method", "preset")}
+    seed, _ = _typed(run, "seed", int), _typed(run, "frames", int, NoneType)
+    expert = _typed(demos or {}, "return_mean", int, float, NoneType)
     head = (names["task"], names["method"], variant or names["preset"], seed)
     tail = (expert and round(expert, 4), commit or "")
-    whole = read_text(log, LARGEST_FILE).split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line
+    whole = read_text(log, MAX_FILE_BYTES).split("\n")[:-1] if log.exists() else []  # a killed process may leave half a line
     episodes = [episode for line in whole if "correlation" in (episode := parse_json(line))]
-    ends = [(_part(e, "frames", int), _part(e, "correlation", int, float, NoneType)) for e in episodes]
+    ends = [(_typed(e, "frames", int), _typed(e, "correlation", int, float, NoneType)) for e in episodes]
     rows, before = [], -1.0
     if np.any(columns["frames"] % 1) or np.any(np.diff(columns["frames"]) < 0):
         raise ValueError("the frames in eval.csv are no whole numbers that grow")
@@ -220,7 +218,7 @@ def _read(folder: Path, variant: str | None = None) -> tuple[list[EvalRow], dict
     return rows, run, torn
 
 
-def _part(table: Any, name: str, *kinds: type) -> Any:
+def _typed(table: Any, name: str, *kinds: type) -> Any:
     """A value of a table, None where it lacks that; `ValueError` where it is of none of these kinds."""
     value = table.get(name) if isinstance(table, dict) else table
     if not isinstance(table, dict) or type(value) not in kinds:
@@ -229,24 +227,21 @@ def _part(table: Any, name: str, *kinds: type) -> Any:
 
 
 def _checked(row: Row) -> Row:
-    """The row; `ValueError` where a value is not of its column's type, no printable name of at most `LONGEST` letters or no
-    number up to `LARGEST`."""
-    for name, hint in _hints(type(row)).items():
+    """Return the row; `ValueError` where a value is not of its column's type.
+
+    Text is printable and has at most `MAX_NAME_LENGTH` characters; a number is at most `MAX_MAGNITUDE`.
+    """
+    for name, hint in COLUMNS[type(row)].items():
         value: Any = getattr(row, name)
         if isinstance(value, str):
-            fits = hint is str and value.isprintable() and len(value) <= LONGEST and (value or name == "commit")
+            fits = hint is str and value.isprintable() and len(value) <= MAX_NAME_LENGTH and (value or name == "commit")
         elif value is None:
             fits = hint == float | None
         else:
-            fits = hint is not str and abs(value) <= LARGEST and (hint is not int or 0 <= value < 2**53)
+            fits = hint is not str and abs(value) <= MAX_MAGNITUDE and (hint is not int or 0 <= value < 2**53)
         if not fits:
             raise ValueError(f"its {name} is {brief(value)}")
     return row
-
-
-@functools.cache
-def _hints(kind: type[EvalRow] | type[TransitionRow]) -> dict[str, Any]:
-    return get_type_hints(kind)
 
 
 def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
@@ -256,7 +251,7 @@ def read_evaluations(folder: Path) -> dict[str, np.ndarray]:
 
 def _evaluations(folder: Path) -> tuple[dict[str, np.ndarray], bool]:
     """The columns without an evaluation whose last line is half written, and whether there was one."""
-    whole, _, half = read_text(folder / "eval.csv", LARGEST_FILE).rpartition("\n")
+    whole, _, half = read_text(folder / "eval.csv", MAX_FILE_BYTES).rpartition("\n")
     table = csv.DictReader(io.StringIO(whole))
     rows = list(table)
     columns = {name: np.array([float(row[name] or "") for row in rows]) for name in table.fieldnames or ()}
@@ -281,30 +276,34 @@ def flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
-def plain(text: str) -> str:
+def escape_formula(text: str) -> str:
     """Text of a CSV file's cell that no spreadsheet takes for a formula: one that looks like one has a ' before it."""
     return f"'{text}" if re.match(r"'*[=+\-@\t\r]", text) else text
 
 
+def write_csv(path: Path, lines: Iterable[Iterable[Any]]) -> None:
+    """Write a CSV file as a whole or not at all; no text in it is a spreadsheet's formula."""
+    partial = path.with_name(f"{path.name}.tmp")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        escaped = ([escape_formula(value) if isinstance(value, str) else value for value in line] for line in lines)
+        csv.writer(file, lineterminator="\n").writerows(escaped)
+    partial.replace(path)
+
+
 def write_rows(path: Path, rows: Sequence[EvalRow] | Sequence[TransitionRow]) -> None:
-    """One header and one line for each row; the whole file or, without rows, nothing and `InputError`."""
+    """Write a header and a line for each row; without rows the file stays as it is, and `InputError` is raised."""
     if not rows:
         raise InputError(f"There are no rows to write to {path}; it stays as it is.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.tmp")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(rows[0]._fields)
-        table.writerows([plain(value) if isinstance(value, str) else value for value in row] for row in rows)
-    partial.replace(path)
+    write_csv(path, [rows[0]._fields, *rows])
 
 
 def read_rows(path: Path) -> list[Any]:
     """The `EvalRow`s or `TransitionRow`s that `write_rows` wrote; columns that a file of an older version lacks are None."""
     try:
-        table = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_FILE))))
+        table = list(csv.DictReader(io.StringIO(read_text(path, MAX_FILE_BYTES))))
         kind: Any = TransitionRow if table and "silhouette" in table[0] else EvalRow
-        parse = {name: _PARSERS[hint] for name, hint in _hints(kind).items()}
+        parse = {name: _PARSERS[hint] for name, hint in COLUMNS[kind].items()}
         columns = set(table[0]) if table else set(parse)
         if wrong := (columns - set(parse)) or (set(parse) - columns - set(kind._field_defaults)):
             raise ValueError(

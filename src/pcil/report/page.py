@@ -75,10 +75,10 @@ def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
     if any(row.correlation is not None for row in rows):
         svg["Reward health"] = {"all": figures.grid(rows, folder / "health", value="correlation", looks=looks)}
     if found.transitions:
-        figures.clouds(found.transitions, folder / "representation")
+        figures.scatter_grid(found.transitions, folder / "representation")
     for task in dict.fromkeys(row.task for row in found.transitions):
         path, mine = folder / f"representation-{files[task]}", [row for row in found.transitions if row.task == task]
-        svg.setdefault("t-SNE", {})[task] = figures.clouds(mine, path, columns=2)
+        svg.setdefault("t-SNE", {})[task] = figures.scatter_grid(mine, path, columns=2)
     return {heading: {title: _uri("svg+xml", t.encode()) for title, t in drawn.items()} for heading, drawn in svg.items()}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pcil import compilation, envs, modules, seeds
 from pcil.errors import WHOLE, InputError
 from pcil.report.embedding import project
-from pcil.report.load import Collection, EvalRow, Source, TransitionRow, flat, named, place
+from pcil.report.load import Collection, EvalRow, Source, TransitionRow, flat, named, sort_key
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.training import learner, loop, presets, runs
@@ -43,7 +43,7 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
             found.transitions.extend(transitions(source, last, trust))
         except Exception as error:  # whatever a damaged folder or somebody's environment raises
             refused.append(named(source.folder, error))
-    found.transitions.sort(key=place)
+    found.transitions.sort(key=sort_key)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
 

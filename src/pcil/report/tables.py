@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import re
@@ -15,7 +14,7 @@ import numpy as np
 from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import OFFLINE, Collection, EvalRow, curves, label, matrix, plain
+from pcil.report.load import OFFLINE, Collection, EvalRow, curves, label, matrix, write_csv
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -216,15 +215,11 @@ def write(name: str, table: Table, folder: Path) -> None:
     """`<name>.md` with title and note, and `<name>.csv`, where an interval has three columns."""
     title, note = words(MAKERS[name])
     (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}", encoding="utf-8")
-    wide = [isinstance(value, Interval) for value in table.rows[0]]
-    header = [(name, f"{name} low", f"{name} high") if w else (name,) for name, w in zip(table.header, wide, strict=True)]
-    with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(map(plain, itertools.chain(*header)))
-        for row in table.rows:
-            flat = itertools.chain(*(value if isinstance(value, Interval) else (value,) for value in row))
-            cells = (plain(value) if isinstance(value, str) else value for value in flat)
-            rows.writerow([round(value, 6) if isinstance(value, float) else value for value in cells])
+    first = zip(table.header, table.rows[0], strict=True)
+    header = [[word, f"{word} low", f"{word} high"] if isinstance(value, Interval) else [word] for word, value in first]
+    split = ([value if isinstance(value, Interval) else (value,) for value in row] for row in table.rows)
+    lines = ([round(value, 6) if isinstance(value, float) else value for value in itertools.chain(*row)] for row in split)
+    write_csv(folder / f"{name}.csv", [itertools.chain(*header), *lines])
 
 
 def _final(runs: Sequence[Sequence[EvalRow]]) -> tuple[int, np.ndarray]:

@@ -65,7 +65,7 @@ def test_files_of_older_versions_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "task,method\nx,y\n", "task,frames\nx,many\n", "\x00\x01\xff"])
 def test_a_file_of_something_else_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match="is no file of results"):
+    with pytest.raises(InputError, match="is not a file of results"):
         read_rows(tmp_path / "x.csv")
 
 

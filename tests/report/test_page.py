@@ -192,6 +192,6 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
     assert "mine.txt" in names and "curves-hopper_hop.png" in names and not any("walker_run" in name for name in names)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "index.html").write_text("<title>mine</title>")
-    with pytest.raises(InputError, match="something else than a report"):
+    with pytest.raises(InputError, match="something other than a report"):
         page.clear(tmp_path / "site")
     assert (tmp_path / "site" / "index.html").read_text() == "<title>mine</title>"

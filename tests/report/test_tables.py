@@ -188,7 +188,7 @@ def test_a_csv_has_every_number(sweep: Collection, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", list(tables.MAKERS))
 def test_every_table_has_a_title_a_note_and_columns_of_its_own(name: str, sweep: Collection) -> None:
-    title, note = tables.words(tables.MAKERS[name])
-    assert 5 < len(title) < 40 and note.endswith(".") and len(note) > 40
+    title, caption = tables.title_and_caption(tables.MAKERS[name])
+    assert 5 < len(title) < 40 and caption.endswith(".") and len(caption) > 40
     table = tables.MAKERS[name](sweep)
     assert len(set(table.header)) == len(table.header) and all(len(row) == len(table.header) for row in table.rows)

@@ -1,4 +1,4 @@
-"""Learning curves and pictures of representations, from rows of results alone; each as PNG and PDF."""
+"""Figures of learning curves and of representations, drawn from rows of results and written as PNG and PDF."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-matplotlib.rcParams["svg.hashsalt"] = "pcil"  # the same figure is the same file
+matplotlib.rcParams["svg.hashsalt"] = "pcil"  # the same figure gives the same file
 LEGEND_ROW = 0.18
-"""Inches that each further row of a legend adds to its figure."""
+"""Inches that each row of a legend after the first adds to its figure."""
 INK, GREY, BLUE = "#1b1b1b", "#808080", "#1f5fbf"
 REWARD_COLOURS = LinearSegmentedColormap.from_list("reward", ["#0b3d1e", "#3f9b3a", "#ffe135"])
-"""The paper's Figure 4: dark green for a low true reward, yellow for a high one."""
+"""As in the paper's Figure 4: dark green for a low true reward, yellow for a high one."""
 
 
 class Style(NamedTuple):
-    """How a method looks on every figure; its marker and dashes are its own, for those who do not see its colour."""
+    """The style of a method on every figure. Marker and dashes are unique too, for readers who cannot tell colours apart."""
 
     colour: str
     marker: str
@@ -47,7 +47,7 @@ class Style(NamedTuple):
 
 
 STYLES = {
-    "pcil": Style("#a60628", "o"),  # colours of the first five and of the expert: the paper's legend, Figure 3
+    "pcil": Style("#a60628", "o"),  # the colours of the first five and of the expert are those of the paper's Figure 3
     "dac": Style("#348abd", "s", (6, 2)),
     "pwil": Style("#467821", "^", (6, 2, 1.5, 2)),
     "sil": Style("#d55e00", "D", (2, 1.5)),
@@ -72,16 +72,16 @@ SPARE_STYLES = [
     Style("#6d4c41", "4", (3, 3)),
     Style("#0077b6", "|", (6, 1, 1, 1, 1, 1)),
 ]
-"""Methods that are not ours, in the order of their names; and variants of a method after its first."""
+"""For methods without a style of their own, in alphabetical order, and for every variant of a method after the first."""
 
 
 def escape_label(text: str) -> str:
-    """A name as a figure shows it: short, and its dollar signs begin no formula."""
+    """A name as text of a figure: shortened, and with dollar signs escaped, which would begin a formula."""
     return shown(text, 70).replace("$", "\\$")
 
 
-def styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, str], Style]:
-    """A look for each method and variant: the method's own, and another one for each further variant of it."""
+def assign_styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, str], Style]:
+    """A style for each method and variant: the first variant of a method has the method's own."""
     found: dict[tuple[str, str], Style] = {}
     order, spare = {method: place for place, method in enumerate(STYLES)}, itertools.cycle(SPARE_STYLES)
     for method, variant in sorted({row[1:3] for row in rows}, key=lambda name: (order.get(name[0], len(order)), name)):
@@ -116,39 +116,39 @@ def grid(
     path: Path,
     columns: int = 3,
     value: str = "return_mean",
-    looks: dict[tuple[str, str], Style] | None = None,
+    styles: dict[tuple[str, str], Style] | None = None,
 ) -> str:
-    """A panel for each task: mean over seeds of each method with Student's 95% interval, every seed behind it, the expert.
+    """Draw a panel for each task: the mean over seeds of each method with Student's 95% interval, the seeds, and the expert.
 
-    A method that takes no step in the environment is a level line at its last return. `value` is the column that is drawn;
-    seeds and expert only for returns. PNG and PDF are written to `path`, SVG is returned.
+    A method that takes no step in the environment is a horizontal line at its last return. `value` is the column to draw;
+    seeds and expert are drawn only for returns. PNG and PDF are written to `path`, and SVG is returned.
     """
-    looks = looks or styles(rows)
+    styles = styles or assign_styles(rows)
     rows = [row for row in rows if getattr(row, value) is not None]
     tasks = list(dict.fromkeys(row.task for row in rows))
     figure, axes = _axes(len(tasks), columns)
     for axis, task in zip(axes, tasks, strict=True):
-        mine = curves(row for row in rows if row.task == task)
-        drawn = [getattr(row, value) for runs in mine.values() for run in runs for row in run]
-        for name in (name for name in looks if (task, *name) in mine):
-            runs, look = mine[task, *name], (looks[name], escape_label(label(name, looks)))
+        groups = curves(row for row in rows if row.task == task)
+        drawn = [getattr(row, value) for runs in groups.values() for run in runs for row in run]
+        for name in (name for name in styles if (task, *name) in groups):
+            runs, text = groups[task, *name], escape_label(label(name, styles))
             if name[0] in OFFLINE:
-                _level_line(axis, matrix(runs, value)[1][:, -1].mean(), *look)
+                _level_line(axis, matrix(runs, value)[1][:, -1].mean(), styles[name], text)
             else:
-                _seed_lines(axis, runs, value, *look)
+                _seed_lines(axis, runs, value, styles[name], text)
         if value == "return_mean":
-            experts = {run[0].expert_return for runs in mine.values() for run in runs} - {None}
+            experts = {run[0].expert_return for runs in groups.values() for run in runs} - {None}
             drawn += [_expert_line(axis, expert) for expert in experts if expert is not None]
         ylabel = {"return_mean": "return", "correlation": "correlation with true reward"}[value]
-        _label_axes(axis, f"{escape_label(task)}, {_count('seed', mine)}", ylabel, drawn)
+        _label_axes(axis, f"{escape_label(task)}, {_count('seed', groups)}", ylabel, drawn)
     return save(figure, path)
 
 
-def aggregate(rows: Sequence[EvalRow], path: Path, looks: dict[tuple[str, str], Style]) -> str:
-    """Share of the expert's return over frames: IQM over all seeds of all tasks of a method, with its bootstrap interval.
+def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str], Style]) -> str:
+    """Draw the share of the expert's return over frames: each method's IQM over seeds and tasks, with bootstrap intervals.
 
-    The legend says of how many tasks where methods have not the same number of them. Nothing is drawn, and "" returned, where
-    no task's expert is known.
+    If methods have different numbers of tasks, the legend states the number. If no task has a known expert, nothing is drawn
+    and "" is returned.
     """
     strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
     for name, runs in curves(rows).items():
@@ -159,17 +159,17 @@ def aggregate(rows: Sequence[EvalRow], path: Path, looks: dict[tuple[str, str], 
         return ""
     figure, (axis,) = _axes(1, 1)
     drawn = [1.0]
-    for name in (name for name in looks if name in strata):
+    for name in (name for name in styles if name in strata):
         tasks = strata[name]
         frames = functools.reduce(np.intersect1d, [own for own, _ in tasks])
         scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        center, text = stats.iqm(*scores), escape_label(label(name, looks))
+        center, text = stats.iqm(*scores), escape_label(label(name, styles))
         if len({len(tasks) for tasks in strata.values()}) > 1:
             text += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
         if name[0] in OFFLINE:
-            _level_line(axis, center[-1], looks[name], text)
+            _level_line(axis, center[-1], styles[name], text)
         else:
-            _band_line(axis, frames, center, stats.bootstrap(stats.iqm, scores), looks[name], text)
+            _band_line(axis, frames, center, stats.bootstrap(stats.iqm, scores), styles[name], text)
         drawn += center.tolist()
     _expert_line(axis, 1.0)
     _label_axes(axis, _count("task", strata), "share of expert (IQM)", drawn)
@@ -177,7 +177,7 @@ def aggregate(rows: Sequence[EvalRow], path: Path, looks: dict[tuple[str, str], 
 
 
 def scatter_grid(transitions: Sequence[TransitionRow], path: Path, columns: int | None = None) -> str:
-    """t-SNE of each method's representation: the first seed's transitions; by default a row a method and a column a task."""
+    """Draw the t-SNE of each method's representation, first seed; by default a row is a method and a column a task."""
     first: dict[tuple[str, ...], list[TransitionRow]] = {name: seeds[0] for name, seeds in curves(transitions).items()}
     tasks, methods = (list(dict.fromkeys(name[part] for name in first)) for part in (slice(1), slice(1, 3)))
     figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
@@ -192,12 +192,12 @@ def scatter_grid(transitions: Sequence[TransitionRow], path: Path, columns: int 
 
 
 def save(figure: Figure, path: Path) -> str:
-    """Write PNG and PDF without a date, close the figure, and return it as SVG; one legend for all panels stands below."""
+    """Add a legend for all panels, write PNG and PDF without a date, close the figure, and return it as SVG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = {str(line.get_label()): line for axis in figure.axes for line in axis.lines}
     lines = {name: line for name, line in lines.items() if not name.startswith("_")}
     if lines:
-        fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of the words and of a line
+        fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of an entry
         columns = max(min(fitting, len(lines)), 1)
         figure.set_figheight(figure.get_figheight() + LEGEND_ROW * (-(-len(lines) // columns) - 1))
         figure.legend(lines.values(), lines, loc="outside lower center", ncols=columns, frameon=False, fontsize=8)
@@ -211,12 +211,12 @@ def save(figure: Figure, path: Path) -> str:
 
 def _write(figure: Figure, file: Path | io.StringIO, **options: Any) -> None:
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph")  # of a name in letters that the font lacks
+        warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that the font lacks
         figure.savefig(file, **options)
 
 
 def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels; what is left of the last row is empty."""
+    """A figure with this number of panels; the rest of the last row stays empty."""
     columns = min(columns, panels)
     rows = -(-panels // columns)
     figsize = size[0] * columns, size[1] * rows
@@ -227,9 +227,11 @@ def _axes(panels: int, columns: int, size: tuple[float, float] = (4.4, 3.2)) -> 
 
 
 def _seed_lines(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style: Style, name: str) -> None:
-    """Each seed's return as a thin line, and their mean with its interval at the frames that all of them have."""
+    """Draw each seed's return as a thin line, and their mean with its interval at the frames that all seeds have."""
     for run in runs if value == "return_mean" else ():
-        axis.plot([p.frames for p in run], [getattr(p, value) for p in run], color=style.colour, alpha=0.35, linewidth=0.7)
+        axis.plot(
+            [row.frames for row in run], [getattr(row, value) for row in run], color=style.colour, alpha=0.35, linewidth=0.7
+        )
     frames, values = matrix(runs, value)
     if len(frames):
         center, *bounds = np.array([stats.mean_interval(column) for column in values.T]).T
@@ -237,27 +239,27 @@ def _seed_lines(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style
 
 
 def _level_line(axis: Axes, value: float, style: Style, label: str) -> None:
-    """The line of a method that takes no step in the environment: one return at all frames."""
+    """Draw a horizontal line for a method that takes no step in the environment."""
     axis.axhline(value, label=label, **style.line)
 
 
 def _band_line(
     axis: Axes, frames: np.ndarray, center: np.ndarray, bounds: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
 ) -> None:
-    """A method's line with a few markers, and the band between the bounds where they are known."""
+    """Draw a method's line with a few markers, and the band between the bounds if they are known."""
     if np.isfinite(bounds[0]).all():
         axis.fill_between(frames, bounds[0], bounds[1], color=style.colour, alpha=0.15, linewidth=0)
     axis.plot(frames, center, label=label, markevery=max(len(frames) // 6, 1), **style.line)
 
 
 def _scatter(axis: Axes, rows: Sequence[TransitionRow], low: float, high: float) -> None:
-    """The agent's transitions coloured by reward, from `low` to `high` on all panels of a task, and the expert's in blue."""
+    """Draw the agent's transitions, coloured by reward on the scale `low` to `high`, and the expert's in blue."""
     expert, agent = ([row for row in rows if (row.reward is None) == of_expert] for of_expert in (True, False))
     colours: dict[str, Any] = {"c": [row.reward for row in agent], "cmap": REWARD_COLOURS, "vmin": low, "vmax": high}
     places = [row.x for row in agent], [row.y for row in agent]
     image = axis.scatter(*places, s=12, linewidths=0, rasterized=True, **colours)
-    look: dict[str, Any] = {"color": BLUE, "marker": "^", "markersize": 3.5, "markeredgewidth": 0, "linestyle": ""}
-    axis.plot([row.x for row in expert], [row.y for row in expert], label="expert", rasterized=True, **look)
+    style: dict[str, Any] = {"color": BLUE, "marker": "^", "markersize": 3.5, "markeredgewidth": 0, "linestyle": ""}
+    axis.plot([row.x for row in expert], [row.y for row in expert], label="expert", rasterized=True, **style)
     bar = axis.figure.colorbar(image, ax=axis, label="true reward of an agent step", shrink=0.8)
     assert bar.solids is not None
     bar.solids.set_rasterized(True)
@@ -268,7 +270,7 @@ def _scatter(axis: Axes, rows: Sequence[TransitionRow], low: float, high: float)
 
 
 def _expert_line(axis: Axes, value: float) -> float:
-    """A line at what the expert has, with its number at the right end; returns the value."""
+    """Draw a line at the expert's return, with the number at its right end; return the value."""
     axis.axhline(value, color=GREY, linestyle="--", linewidth=1, label="demos")
     where = {"xycoords": ("axes fraction", "data"), "xytext": (4, 0), "textcoords": "offset points"}
     axis.annotate(f"{value:.0f}", (1, value), fontsize=7, color=INK, va="center", **where)
@@ -276,16 +278,16 @@ def _expert_line(axis: Axes, value: float) -> float:
 
 
 def _count(word: str, groups: Mapping[Any, Sized]) -> str:
-    """How many of something the groups have, such as "2 to 3 seeds"."""
+    """The range of the groups' sizes, such as "2 to 3 seeds"."""
     counts = sorted({len(group) for group in groups.values()})
     return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
 
 
 def _label_axes(axis: Axes, title: str, ylabel: str, drawn: Sequence[float]) -> None:
-    """Words, and limits that hold every value of `drawn`; a wide band may reach beyond them."""
+    """Set title, labels and limits. The limits include every value of `drawn`; a wide band may extend beyond them."""
     low, high = min(drawn), max(drawn)
-    room = 0.08 * (high - low) or 1
+    margin = 0.08 * (high - low) or 1
     axis.set(title=title, xlabel="frames (environment control steps)", ylabel=ylabel)
-    axis.set_ylim(0 if low >= 0 else low - room, high + room)  # most returns; some environments pay less than nothing
+    axis.set_ylim(0 if low >= 0 else low - margin, high + margin)  # returns can be negative in some environments
     axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3), useMathText=True)
     axis.spines[["top", "right"]].set_visible(False)

@@ -1,4 +1,4 @@
-"""The report: tables, figures, and a page that needs nothing but itself."""
+"""The report: tables, figures, and a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from pcil.report import figures, tables
 from pcil.report.load import Collection, write_rows
 
 TITLE = "<title>pcil report"
-"""By which a page is known as ours."""
+"""The text that identifies a page as a report."""
 
 
 def clear(out: Path) -> None:
-    """Make the folder `out`, or take away what an earlier report left there; `InputError` where something else is in it."""
+    """Create the folder `out`, or remove the files of an earlier report; `InputError` if it holds anything else."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         old = out / "index.html"
         text = old.read_text(errors="replace")[:1000] if old.is_file() else None
-        if any(out.iterdir()) and (text is None or (text and TITLE not in text)):  # a full disk leaves an empty one
-            raise InputError(f"{out} holds something else than a report; give --out a new or empty folder.")
+        if any(out.iterdir()) and (text is None or (text and TITLE not in text)):  # a full disk leaves an empty page
+            raise InputError(f"{out} holds something other than a report; give --out a new or empty folder.")
         for folder, kinds in (("figures", (".png", ".pdf")), ("tables", (".csv", ".md"))):
             for file in (out / folder).glob("*"):
                 if file.suffix in kinds:
                     file.unlink()
-        old.write_text(f"<!doctype html>{TITLE}</title>This report is not finished.")  # known as ours, should this one stop
+        old.write_text(f"<!doctype html>{TITLE}</title>This report is not finished.")  # an interrupted report can be replaced
     except OSError as error:
         raise InputError(f"The folder {out} can't be written ({error.strerror}); give --out another one.") from error
 
 
 def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
-    """Write `index.html`, `figures/` and `tables/` into `out`, and return the page's path.
+    """Write `index.html`, `figures/` and `tables/` into `out`, and return the path of the page.
 
-    `films` are animations (WebP) by their title. The same input gives the same files.
+    `films` are animations (WebP) by title. The same input gives the same files.
     """
     (out / "tables").mkdir(parents=True, exist_ok=True)
     written = {name: table for name, make in tables.MAKERS.items() if (table := make(found)).rows}
@@ -53,7 +53,7 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
         methods=list(dict.fromkeys(row.method for row in found.rows)),
         found=found,
         last={row[:4]: row for row in found.rows},
-        tables=[(name, *tables.words(tables.MAKERS[name]), table) for name, table in written.items()],
+        tables=[(name, *tables.title_and_caption(tables.MAKERS[name]), table) for name, table in written.items()],
         figures=draw(found, out / "figures"),
         films={title: _uri("webp", film) for title, film in films.items()},
     )
@@ -62,18 +62,18 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
 
 
 def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
-    """Every figure into `folder`; for the page, by heading and then by title, as data URIs."""
-    rows, looks = found.rows, figures.styles(found.rows)
+    """Write every figure to `folder`; return those of the page as data URIs, by heading and then by title."""
+    rows, styles = found.rows, figures.assign_styles(found.rows)
     files = _file_names([row.task for row in (*rows, *found.transitions)])
     svg: dict[str, dict[str, str]] = {"Learning curves": {}}
-    figures.grid(rows, folder / "curves", looks=looks)  # all tasks on one sheet, as papers print it
+    figures.grid(rows, folder / "curves", styles=styles)  # all tasks on one sheet, as papers print it
     for task in dict.fromkeys(row.task for row in rows):
         path = folder / f"curves-{files[task]}"
-        svg["Learning curves"][task] = figures.grid([row for row in rows if row.task == task], path, looks=looks)
-    if together := figures.aggregate(rows, folder / "aggregate", looks):
+        svg["Learning curves"][task] = figures.grid([row for row in rows if row.task == task], path, styles=styles)
+    if together := figures.aggregate(rows, folder / "aggregate", styles):
         svg["Learning curves"]["all tasks"] = together
     if any(row.correlation is not None for row in rows):
-        svg["Reward health"] = {"all": figures.grid(rows, folder / "health", value="correlation", looks=looks)}
+        svg["Reward health"] = {"all": figures.grid(rows, folder / "health", value="correlation", styles=styles)}
     if found.transitions:
         figures.scatter_grid(found.transitions, folder / "representation")
     for task in dict.fromkeys(row.task for row in found.transitions):
@@ -83,7 +83,7 @@ def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
 
 
 def _file_names(tasks: Iterable[str]) -> dict[str, str]:
-    """A part of a file's name for each task, that no other task has."""
+    """A unique part of a file name for each task."""
     names: dict[str, str] = {}
     for task in dict.fromkeys(tasks):
         name = re.sub(r"[^A-Za-z0-9_-]", "_", task)[:100]

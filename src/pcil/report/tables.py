@@ -1,4 +1,4 @@
-"""Tables of a set of runs: CSV with every number, Markdown and HTML to be read. Each maker's docstring is its table's note."""
+"""Tables of a set of runs, as CSV, Markdown and HTML. The docstring of a maker is the title and the caption of its table."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviati
 PAPER_TASKS = ("finger_spin", "walker_run", "hopper_stand", "hopper_hop")
 PAPER_SEEDS = 3
 SHARES = (0.5, 0.8, 0.9)
-"""Of the expert's return, to which the way is measured."""
+"""Shares of the expert's return for which sample efficiency is measured."""
 KEY = ("task", "method", "variant")
 
 
 class Table(NamedTuple):
-    """A header and rows of words, numbers, `Interval`s and None; empty where there is nothing to say."""
+    """A header and rows of text, numbers, `Interval`s and None; no rows if the table does not apply to the runs."""
 
     header: tuple[str, ...]
     rows: list[tuple[Any, ...]]
@@ -47,9 +47,9 @@ def finals(found: Collection) -> Table:
     for name, runs in curves(found.rows).items():
         frames, final = _final(runs)
         share = stats.share_of_expert(runs, final)
-        spread = float(np.std(final, ddof=1)) if len(final) > 1 else None
+        deviation = float(np.std(final, ddof=1)) if len(final) > 1 else None
         expert = runs[0][-1].expert_return, None if share is None else float(share.mean())
-        ours = stats.mean_interval(final), spread, stats.iqm_interval([final])
+        ours = stats.mean_interval(final), deviation, stats.iqm_interval([final])
         rows.append((*name, *ours, *expert, len(final), frames))
     return Table((*KEY, "mean", "sd", "IQM", "expert", "of expert", "seeds", "frames"), rows)
 
@@ -129,8 +129,8 @@ def efficiency(found: Collection) -> Table:
             cells.append(sum(row is not None for row in reached))
         if stats.share_of_expert(runs, np.zeros(len(runs))) is not None:
             rows.append((*cells, len(runs), _final(runs)[0]))
-    words = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
-    return Table((*KEY, *words, "seeds", "frames"), rows)
+    columns = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
+    return Table((*KEY, *columns, "seeds", "frames"), rows)
 
 
 def improvement(found: Collection) -> Table:
@@ -186,14 +186,14 @@ MAKERS: dict[str, Maker] = {
 }
 
 
-def words(make: Maker) -> tuple[str, str]:
-    """Title and note of a maker's table."""
-    title, _, note = " ".join((make.__doc__ or "").split()).partition(": ")
-    return title, note[:1].upper() + note[1:]
+def title_and_caption(make: Maker) -> tuple[str, str]:
+    """The title and the caption of a maker's table."""
+    title, _, caption = " ".join((make.__doc__ or "").split()).partition(": ")
+    return title, caption[:1].upper() + caption[1:]
 
 
 def cell(value: Any) -> str:
-    """A cell as people read it: one decimal from 10 on, two below."""
+    """A cell as text: numbers from 10 on with one decimal, smaller ones with two."""
     if isinstance(value, Interval):
         return cell(value.value) + ("" if math.isnan(value.low) else f" [{cell(value.low)}, {cell(value.high)}]")
     if isinstance(value, float):
@@ -202,7 +202,7 @@ def cell(value: Any) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table alone, with a line break at its end; no text in it is markup."""
+    """The table in Markdown, with a line break at its end; text is escaped, so that none of it is markup."""
 
     def escaped(value: Any) -> str:
         return re.sub(r"[\\`*<\[|&$~]", r"\\\g<0>", shown(value)) if isinstance(value, str) else cell(value)
@@ -212,9 +212,9 @@ def markdown(table: Table) -> str:
 
 
 def write(name: str, table: Table, folder: Path) -> None:
-    """`<name>.md` with title and note, and `<name>.csv`, where an interval has three columns."""
-    title, note = words(MAKERS[name])
-    (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}", encoding="utf-8")
+    """Write `<name>.md` with title and caption, and `<name>.csv`, in which an interval has three columns."""
+    title, caption = title_and_caption(MAKERS[name])
+    (folder / f"{name}.md").write_text(f"# {title}\n\n{caption}\n\n{markdown(table)}", encoding="utf-8")
     first = zip(table.header, table.rows[0], strict=True)
     header = [[word, f"{word} low", f"{word} high"] if isinstance(value, Interval) else [word] for word, value in first]
     split = ([value if isinstance(value, Interval) else (value,) for value in row] for row in table.rows)
@@ -223,14 +223,16 @@ def write(name: str, table: Table, folder: Path) -> None:
 
 
 def _final(runs: Sequence[Sequence[EvalRow]]) -> tuple[int, np.ndarray]:
-    """The last frames at which every seed was evaluated, and the returns `[seeds]` there."""
+    """The number of frames of the last evaluation that every seed has, and the returns `[seeds]` there."""
     frames, returns = matrix(runs)
     return int(frames[-1]), returns[:, -1]
 
 
 def _at_the_same_frames(x: list[list[EvalRow]], y: list[list[EvalRow]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline, and
-    None where they have no evaluation in common."""
+    """The returns `[seeds]` of two methods at the last evaluation that all their runs have; None if they have none in common.
+
+    If one of the methods takes no step in the environment, each has its own last evaluation.
+    """
     if {x[0][0].method, y[0][0].method} & set(OFFLINE):
         return _final(x)[1], _final(y)[1]
     if not len(matrix([*x, *y])[0]):
@@ -240,7 +242,7 @@ def _at_the_same_frames(x: list[list[EvalRow]], y: list[list[EvalRow]]) -> tuple
 
 
 def _by_method(rows: Sequence[EvalRow]) -> dict[Any, dict[str, list[list[EvalRow]]]]:
-    """The seeds' rows by method and variant, then by task."""
+    """The rows of the seeds, by method and variant and then by task."""
     found: dict[Any, dict[str, list[list[EvalRow]]]] = {}
     for (task, *name), runs in curves(rows).items():
         found.setdefault(tuple(name), {})[task] = runs

@@ -40,8 +40,8 @@ class Table(NamedTuple):
 def finals(found: Collection) -> Table:
     """Final return of each task: mean over seeds at the last evaluation that all of them have, with Student's 95% interval.
 
-    sd is the sample standard deviation. The interquartile mean (IQM) has a bootstrap interval; of three seeds the IQM is the
-    mean, and a bootstrap of three is too narrow.
+    sd is the sample standard deviation. The interquartile mean (IQM) has a bootstrap interval. Of three seeds the IQM is the
+    mean, and its bootstrap interval is too narrow.
     """
     rows = []
     for name, runs in curves(found.rows).items():
@@ -55,11 +55,11 @@ def finals(found: Collection) -> Table:
 
 
 def overview(found: Collection) -> Table:
-    """Returns at a glance: the mean over seeds that the next tables explain, for each task, the demonstrations' beside it.
+    """Returns at a glance: mean final return over seeds for each task, with its 95% interval, and the demonstrations' return.
 
-    A blank was not run, and a method that has fewer frames of a task than another says how many. The longer of the two axes
-    goes down.
+    A blank cell was not run. Where a method has fewer frames on a task than another method, its cell states how many.
     """
+    # the longer of the two axes runs down the page
     means, experts, lengths = {}, {}, {}
     for (task, *name), runs in curves(found.rows).items():
         frames, final = _final(runs)
@@ -78,10 +78,10 @@ def overview(found: Collection) -> Table:
 
 
 def paper(found: Collection) -> Table:
-    """Beside the paper's numbers: its Table 1, mean and standard deviation over 3 seeds after 2,000,000 frames.
+    """Comparison with the paper: Table 1 of the paper has mean and standard deviation over 3 seeds after 2,000,000 frames.
 
-    Its interval is Student's from those, as ours is; if its deviation is a population's and not a sample's, which it does not
-    say, the interval is 1.22 times as wide. Mind the frames of ours.
+    Both intervals are Student's. The paper does not say whether its standard deviation is that of a sample, which is assumed
+    here, or of a population; in the latter case its interval is 1.22 times as wide. Our runs may have fewer frames.
     """
     rows = []
     for (task, method, variant), runs in curves(found.rows).items():
@@ -96,10 +96,10 @@ def paper(found: Collection) -> Table:
 
 
 def aggregate(found: Collection) -> Table:
-    """All tasks together: final return as a share of the demonstrations', over all seeds of all tasks of a method.
+    """All tasks together: final return as a share of the demonstrations' return, over all seeds and tasks of a method.
 
-    The intervals are a bootstrap's that draws seeds within each task. Compare methods only where they have the same tasks and
-    the same frames.
+    The bootstrap intervals draw seeds within each task. Compare methods only if they have the same tasks and the same number
+    of frames.
     """
     rows = []
     for name, tasks in _by_method(found.rows).items():
@@ -113,11 +113,11 @@ def aggregate(found: Collection) -> Table:
 
 
 def efficiency(found: Collection) -> Table:
-    """Sample efficiency: the first evaluation at which a seed has 50, 80 and 90% of the demonstrations' return.
+    """Sample efficiency: the first evaluation at which a seed reaches 50, 80 and 90% of the demonstrations' return.
 
-    How many seeds got there within the frames of the last column, and the median over all seeds, which is blank where half of
-    them did not. Minutes are wall-clock time since the run began: core-minutes where each run has one core to itself, and more
-    where it shared one. Methods that take no step in the environment are left out.
+    The table has the median over all seeds, which is blank if half of them never reach the share, and the number of seeds that
+    reach it within the frames of the last column. Minutes are wall-clock time since the start of the run; they equal
+    core-minutes only if the run had a core to itself. Methods that take no step in the environment are left out.
     """
     rows = []
     for name, runs in curves(row for row in found.rows if row.method not in OFFLINE).items():
@@ -134,10 +134,10 @@ def efficiency(found: Collection) -> Table:
 
 
 def improvement(found: Collection) -> Table:
-    """Probability of improvement: the chance that a run of the first method ends above one of the second.
+    """Probability of improvement: the probability that a run of the first method has a higher return than one of the second.
 
-    On the same task and at the last evaluation that both have (of a method that takes no step in the environment, its last), a
-    tie being half; the mean over the tasks that both have, with a bootstrap interval.
+    Runs are compared on the same task, at the last evaluation that both methods have (a method that takes no step in the
+    environment, at its own last); a tie counts one half. The value is the mean over common tasks, with a bootstrap interval.
     """
     rows = []
     for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.rows).items(), 2):
@@ -149,10 +149,10 @@ def improvement(found: Collection) -> Table:
 
 
 def health(found: Collection) -> Table:
-    """Health of the learned reward: its correlation with the true one over the steps of a training episode.
+    """Health of the learned reward: its correlation with the true reward over the steps of a training episode.
 
-    Mean over the episodes of each half of the run in which both vary, with Student's interval over seeds. The task's own reward
-    has 1.
+    Each value is the mean over the episodes of one half of the run in which both rewards vary, with Student's interval over
+    seeds. The task's own reward has correlation 1.
     """
     rows = []
     for name, runs in curves(found.rows).items():
@@ -164,11 +164,11 @@ def health(found: Collection) -> Table:
 
 
 def representation(found: Collection) -> Table:
-    """Representation: how well distance to the experts tells the true reward, and whether the experts are one cluster.
+    """Representation: how well the distance to the experts predicts the true reward, and whether the experts form a cluster.
 
-    Both in the representation itself, not in its picture. Spearman's rank correlation of an agent transition's distance to
-    the experts' mean with its reward is -1 where distance tells all. The experts' mean silhouette is 1 where they lie together,
-    apart from the agent, and 0 or less where they are scattered among its transitions.
+    Both are computed in the representation, not in its t-SNE. Spearman's rank correlation between an agent transition's
+    distance to the experts' mean and its reward is -1 if the distance determines the order of the rewards. The experts' mean
+    silhouette is near 1 if they form a cluster apart from the agent, and 0 or less if they are scattered among its transitions.
     """
     rows = []
     for name, seeds in curves(found.transitions).items():

@@ -1,6 +1,6 @@
-"""Gather the evaluations of finished runs, at any depth, into a small CSV: python experiments/collect.py FILE.csv FOLDER ...
+"""Collect the evaluations of finished runs, at any depth, in a CSV file: python experiments/collect.py FILE.csv FOLDER ...
 
-Rows that the file has of other runs stay.
+Rows of other runs that are already in the file are kept.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Rows of the representations that rewards have learned: the networks of a run folder on transitions of expert and agent."""
+"""Transitions of expert and agent in the representation that a run's reward has learned."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from pcil.training.config import REGISTRIES, Run, registered
 from pcil.types import Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
-"""As many transitions as the paper's Figure 4 has."""
+"""The numbers of transitions in the paper's Figure 4."""
 NUMBERS = 2**28
-"""At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
+"""The largest number of parameters of a run that are restored: 1 GiB."""
 
 
 def add(found: Collection, trust: Sequence[str] = ()) -> None:
-    """Rows of every run that has a representation into `found.transitions`, and a note of those that should have and have not.
+    """Add rows to `found.transitions` for every run with a representation, and a note about runs whose networks can't be read.
 
     `trust` are the modules that the runs' files may name.
     """
@@ -41,7 +41,7 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         last = [row for row in found.rows if row[:4] == name][-1]
         try:
             found.transitions.extend(transitions(source, last, trust))
-        except Exception as error:  # whatever a damaged folder or somebody's environment raises
+        except Exception as error:  # a damaged folder or a user's environment can raise anything
             refused.append(named(source.folder, error))
     found.transitions.sort(key=sort_key)
     if refused:
@@ -49,9 +49,9 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
 
 
 def transitions(source: Source, row: EvalRow, trust: Sequence[str] = ()) -> list[TransitionRow]:
-    """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
+    """Embed random steps of the demonstrations and of the next training episode with the networks of the latest checkpoint.
 
-    Empty where the run's reward has no representation; `InputError` where it can't be restored.
+    Empty if the run's reward has no representation; `InputError` if the run can't be restored.
     """
     run = restored(source.settings)
     if type(run.reward).representation is Reward.representation:
@@ -72,26 +72,26 @@ def transitions(source: Source, row: EvalRow, trust: Sequence[str] = ()) -> list
         frames = state.counters.frames
         episode = loop.play(dataclasses.replace(run, update_every=WHOLE), env, envs.spec(env), state)
     embed = learner.frozen_embed(run.learner, state.learner.agent)
-    seen = []
+    embeddings = []
     for episodes, rows in ((demos.episodes, EXPERT_STEPS), ([episode], AGENT_STEPS)):
         obs, action, reward = _steps(run, episodes, rows, rng)
         embedded = run.reward.representation(state.learner.reward, jnp.asarray(obs), jnp.asarray(action), embed)
-        seen.append((np.asarray(embedded), reward))
-    (expert, _), (agent, reward) = seen
+        embeddings.append((np.asarray(embedded), reward))
+    (expert, _), (agent, reward) = embeddings
     return project(expert, agent, reward, row._replace(frames=frames))
 
 
 def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings by dotted names with those that they lack at their class's default; as they are where no run has them."""
+    """Settings by dotted names, completed with the defaults of those that are missing; unchanged if they fit no run."""
     try:
         own = {f"{part}.class": registered(part, settings[f"{part}.class"]) for part in REGISTRIES}
         return flat(_made(settings).plain.to_json()) | settings | own
-    except Exception:  # presets are made for settings of every kind, here of a file from anywhere
+    except Exception:  # the settings are from a file that may hold anything
         return settings
 
 
 def restored(settings: dict[str, Any]) -> Run:
-    """The run whose `run.json` has these settings, by dotted names; only our own rewards and agents are ever made."""
+    """The run with these settings, by dotted names; only rewards and agents of this package are created."""
     run = _made(settings)
     if flat(run.to_json()) != settings:
         raise InputError(f"the run of {run.task} by {run.method} has settings that this version does not make.")
@@ -103,7 +103,7 @@ def _made(settings: dict[str, Any]) -> Run:
 
 
 def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """So many random steps, none twice: the states that the reward reads, the actions, the environment's rewards."""
+    """Random distinct steps: the states that the reward reads, the actions, and the environment's rewards."""
     episodes = [loop.absorbed(run, episode) for episode in episodes]
     part = slice(1, None) if run.reward.reads == "next_obs" else slice(None, -1)
     kinds = zip(*((episode.obs[part], episode.action, episode.reward) for episode in episodes), strict=True)

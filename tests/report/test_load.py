@@ -10,7 +10,7 @@ import pytest
 
 from fake_runs import fake_run, fake_sweep
 from pcil.errors import InputError
-from pcil.report.load import EvalRow, TransitionRow, collect, curves, flat, label, matrix, read_rows, read_run, write_rows
+from pcil.report.load import EvalRow, TransitionRow, by_variant, collect, flat, label, matrix, read_rows, read_run, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training.config import MACHINE_SETTINGS
 
@@ -27,7 +27,7 @@ def make_run(folder: Path) -> Path:
     return folder
 
 
-def test_each_evaluation_is_one_point(tmp_path: Path) -> None:
+def test_each_evaluation_is_one_row(tmp_path: Path) -> None:
     """The correlation is that of the episodes since the evaluation before which have one: null is none, and so is the 0 of
     older logs. Half a line of a killed run is no episode."""
     rows = read_run(make_run(tmp_path / "run"))
@@ -104,10 +104,10 @@ def test_the_order_of_the_paths_changes_nothing(tmp_path: Path) -> None:
     root = fake_sweep(tmp_path)
     one, two = (collect(sorted(root.glob("*/*"), reverse=reverse)).rows for reverse in (False, True))
     assert one == two
-    assert [name[:2] for name in curves(one)] == [(t, m) for t in ("hopper_stand", "walker_run") for m in ("pcil", "dac")]
+    assert [name[:2] for name in by_variant(one)] == [(t, m) for t in ("hopper_stand", "walker_run") for m in ("pcil", "dac")]
 
 
-def test_a_csv_gives_the_same_points_as_its_runs(tmp_path: Path) -> None:
+def test_a_csv_gives_the_same_rows_as_its_runs(tmp_path: Path) -> None:
     found = collect([fake_sweep(tmp_path / "sweep")])
     write_rows(tmp_path / "all.csv", found.rows)
     again = collect([tmp_path / "all.csv"])
@@ -209,7 +209,7 @@ def test_without_any_run_the_reason_is_given(tmp_path: Path) -> None:
 def test_a_matrix_has_the_frames_that_all_seeds_have(tmp_path: Path) -> None:
     fake_run(tmp_path / "a", {0: 1, 1000: 2, 2000: 3}, correlation=[0.5, 0.6])
     fake_run(tmp_path / "b", {0: 4, 2000: 5, 3000: 6}, seed=2, correlation=[0.7, 0.8])
-    (runs,) = curves(collect([tmp_path]).rows).values()
+    (runs,) = by_variant(collect([tmp_path]).rows).values()
     frames, values = matrix(runs)
     assert frames.tolist() == [0, 2000] and values.tolist() == [[1, 3], [4, 5]]
     frames, values = matrix(runs, "correlation")

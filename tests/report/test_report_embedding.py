@@ -54,7 +54,9 @@ def test_what_is_apart_is_drawn_apart() -> None:
     assert project(EXPERT, AGENT + 50, REWARD, RUN) == transitions
 
 
-def dots_of(distances: list[float], rewards: list[float], silhouettes: tuple[float, ...] = (0.5, 0.25)) -> list[TransitionRow]:
+def transitions_of(
+    distances: list[float], rewards: list[float], silhouettes: tuple[float, ...] = (0.5, 0.25)
+) -> list[TransitionRow]:
     head = RUN[:5]
     experts = [TransitionRow(*head, None, 0.0, value, 0.0, 0.0) for value in silhouettes]
     pairs = zip(distances, rewards, strict=True)
@@ -65,15 +67,15 @@ def dots_of(distances: list[float], rewards: list[float], silhouettes: tuple[flo
 @given(st.lists(st.integers(0, 100).map(float), min_size=3, max_size=20, unique=True))
 def test_distance_that_tells_all_has_rank_correlation_minus_one(distances: list[float]) -> None:
     """However reward falls with distance, as long as it falls; the agent's silhouettes do not count."""
-    assert measures(dots_of(distances, [math.exp(-d / 50) for d in distances])) == pytest.approx((-1, 0.375))
-    assert measures(dots_of(distances, [d**3 for d in distances]))[0] == pytest.approx(1)
+    assert measures(transitions_of(distances, [math.exp(-d / 50) for d in distances])) == pytest.approx((-1, 0.375))
+    assert measures(transitions_of(distances, [d**3 for d in distances]))[0] == pytest.approx(1)
 
 
 def test_a_reward_that_never_varies_tells_nothing() -> None:
-    assert math.isnan(measures(dots_of([1.0, 2.0, 3.0], [5.0, 5.0, 5.0]))[0])
-    assert math.isnan(measures(dots_of([1.0, 1.0, 1.0], [5.0, 6.0, 7.0]))[0])
+    assert math.isnan(measures(transitions_of([1.0, 2.0, 3.0], [5.0, 5.0, 5.0]))[0])
+    assert math.isnan(measures(transitions_of([1.0, 1.0, 1.0], [5.0, 6.0, 7.0]))[0])
 
 
 def test_ties_share_their_rank() -> None:
     """Ranks 1, 2.5, 2.5, 4 against 4, 3, 2, 1: -4.5 / sqrt(4.5 x 5)."""
-    assert measures(dots_of([1.0, 2.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]))[0] == pytest.approx(-4.5 / math.sqrt(22.5))
+    assert measures(transitions_of([1.0, 2.0, 2.0, 3.0], [9.0, 8.0, 7.0, 6.0]))[0] == pytest.approx(-4.5 / math.sqrt(22.5))

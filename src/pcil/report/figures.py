@@ -16,7 +16,7 @@ import numpy as np
 
 from pcil.errors import shown
 from pcil.report import stats
-from pcil.report.load import OFFLINE, EvalRow, TransitionRow, curves, label, matrix, read_run
+from pcil.report.load import OFFLINE, EvalRow, TransitionRow, by_variant, label, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -128,7 +128,7 @@ def grid(
     tasks = list(dict.fromkeys(row.task for row in rows))
     figure, axes = _axes(len(tasks), columns)
     for axis, task in zip(axes, tasks, strict=True):
-        groups = curves(row for row in rows if row.task == task)
+        groups = by_variant(row for row in rows if row.task == task)
         drawn = [getattr(row, value) for runs in groups.values() for run in runs for row in run]
         for name in (name for name in styles if (task, *name) in groups):
             runs, text = groups[task, *name], escape_label(label(name, styles))
@@ -151,7 +151,7 @@ def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str],
     and "" is returned.
     """
     strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
-    for name, runs in curves(rows).items():
+    for name, runs in by_variant(rows).items():
         frames, returns = matrix(runs)
         if (share := stats.share_of_expert(runs, returns)) is not None:
             strata.setdefault(name[1:], []).append((frames, share))
@@ -178,7 +178,7 @@ def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str],
 
 def scatter_grid(transitions: Sequence[TransitionRow], path: Path, columns: int | None = None) -> str:
     """Draw the t-SNE of each method's representation, first seed; by default a row is a method and a column a task."""
-    first: dict[tuple[str, ...], list[TransitionRow]] = {name: seeds[0] for name, seeds in curves(transitions).items()}
+    first: dict[tuple[str, ...], list[TransitionRow]] = {name: seeds[0] for name, seeds in by_variant(transitions).items()}
     tasks, methods = (list(dict.fromkeys(name[part] for name in first)) for part in (slice(1), slice(1, 3)))
     figure, axes = _axes(len(tasks) * len(methods), columns or len(tasks), (3.4, 3.2))
     for axis, name in zip(axes, ((*task, *method) for method in methods for task in tasks), strict=True):

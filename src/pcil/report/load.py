@@ -134,7 +134,7 @@ def collect(paths: Sequence[Path], complete: Callable[[dict[str, Any]], dict[str
         reason = f" ({notes[0].removesuffix('.')})" if notes else ""
         raise InputError(f"There is no run in {where}{reason}; give folders that pcil train made.")
     transitions.sort(key=sort_key)
-    for name, seeds in curves(rows).items():
+    for name, seeds in by_variant(rows).items():
         if not len(matrix(seeds)[0]):
             seed = seeds[0][0].seed
             notes.append(f"The seeds of {', '.join(name)} have no frames in common; only seed {seed} is shown.")
@@ -160,7 +160,7 @@ def sort_key(row: EvalRow | TransitionRow) -> tuple[Any, ...]:
     return (row.task, row.method != "pcil", *row[1:5])
 
 
-def curves(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[list[Row]]]:
+def by_variant(rows: Iterable[Row]) -> dict[tuple[str, str, str], list[list[Row]]]:
     """The rows of each task, method and variant, as one list for each seed."""
     groups: dict[tuple[str, str, str], dict[int, list[Row]]] = {}
     for row in rows:
@@ -312,7 +312,7 @@ def read_rows(path: Path) -> list[Any]:
                 f"{shown(str(min(wrong, key=str)), 100)} is {'missing' if wrong <= set(parse) else 'not a column of it'}"
             )
         rows = [_checked(kind(**{name: parse[name](value) for name, value in row.items()})) for row in table]
-        for runs in curves(row for row in rows if isinstance(row, TransitionRow)).values():
+        for runs in by_variant(row for row in rows if isinstance(row, TransitionRow)).values():
             if any(len({row.reward is None for row in run}) < 2 for run in runs):
                 raise ValueError("it has a run without transitions of expert and agent")
         return rows

@@ -14,7 +14,7 @@ import numpy as np
 from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import OFFLINE, Collection, EvalRow, curves, label, matrix, write_csv
+from pcil.report.load import OFFLINE, Collection, EvalRow, by_variant, label, matrix, write_csv
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -44,7 +44,7 @@ def finals(found: Collection) -> Table:
     mean, and its bootstrap interval is too narrow.
     """
     rows = []
-    for name, runs in curves(found.rows).items():
+    for name, runs in by_variant(found.rows).items():
         frames, final = _final(runs)
         share = stats.share_of_expert(runs, final)
         deviation = float(np.std(final, ddof=1)) if len(final) > 1 else None
@@ -61,7 +61,7 @@ def overview(found: Collection) -> Table:
     """
     # the longer of the two axes runs down the page
     means, experts, lengths = {}, {}, {}
-    for (task, *name), runs in curves(found.rows).items():
+    for (task, *name), runs in by_variant(found.rows).items():
         frames, final = _final(runs)
         means[task, tuple(name)] = stats.mean_interval(final)
         lengths[task, tuple(name)] = 0 if name[0] in OFFLINE else frames
@@ -84,7 +84,7 @@ def paper(found: Collection) -> Table:
     here, or of a population; in the latter case its interval is 1.22 times as wide. Our runs may have fewer frames.
     """
     rows = []
-    for (task, method, variant), runs in curves(found.rows).items():
+    for (task, method, variant), runs in by_variant(found.rows).items():
         if task in PAPER_TASKS and method in PAPER:
             frames, final = _final(runs)
             published = stats.student(*PAPER[method][PAPER_TASKS.index(task)], PAPER_SEEDS)
@@ -120,7 +120,7 @@ def efficiency(found: Collection) -> Table:
     core-minutes only if the run had a core to itself. Methods that take no step in the environment are left out.
     """
     rows = []
-    for name, runs in curves(row for row in found.rows if row.method not in OFFLINE).items():
+    for name, runs in by_variant(row for row in found.rows if row.method not in OFFLINE).items():
         cells: list[Any] = [*name]
         for reached in ([stats.first_reach(run, share) for run in runs] for share in SHARES):
             frames = np.median([row.frames if row else math.inf for row in reached])
@@ -155,7 +155,7 @@ def health(found: Collection) -> Table:
     seeds. The task's own reward has correlation 1.
     """
     rows = []
-    for name, runs in curves(found.rows).items():
+    for name, runs in by_variant(found.rows).items():
         frames, correlation = matrix(runs, "correlation")
         if len(frames) > 1:
             halves = np.array_split(correlation, 2, axis=1)
@@ -171,7 +171,7 @@ def representation(found: Collection) -> Table:
     silhouette is near 1 if they form a cluster apart from the agent, and 0 or less if they are scattered among its transitions.
     """
     rows = []
-    for name, seeds in curves(found.transitions).items():
+    for name, seeds in by_variant(found.transitions).items():
         columns: list[Any] = []
         for values in zip(*map(measures, seeds), strict=True):
             each = ", ".join(f"{run[0].seed}: {value:.2f}" for run, value in zip(seeds, values, strict=True))
@@ -244,7 +244,7 @@ def _at_the_same_frames(x: list[list[EvalRow]], y: list[list[EvalRow]]) -> tuple
 def _by_method(rows: Sequence[EvalRow]) -> dict[Any, dict[str, list[list[EvalRow]]]]:
     """The rows of the seeds, by method and variant and then by task."""
     found: dict[Any, dict[str, list[list[EvalRow]]]] = {}
-    for (task, *name), runs in curves(rows).items():
+    for (task, *name), runs in by_variant(rows).items():
         found.setdefault(tuple(name), {})[task] = runs
     return found
 

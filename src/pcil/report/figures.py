@@ -194,8 +194,8 @@ def scatter_grid(transitions: Sequence[TransitionRow], path: Path, columns: int 
 def save(figure: Figure, path: Path) -> str:
     """Add a legend for all panels, write PNG and PDF without a date, close the figure, and return it as SVG."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = {str(line.get_label()): line for axis in figure.axes for line in axis.lines}
-    lines = {name: line for name, line in lines.items() if not name.startswith("_")}
+    drawn = ((str(line.get_label()), line) for axis in figure.axes for line in axis.lines)
+    lines = {name: line for name, line in drawn if not name.startswith("_")}  # Matplotlib's names of unlabelled lines
     if lines:
         fitting = int(72 * figure.get_figwidth() / (4.6 * max(map(len, lines)) + 36))  # points of an entry
         columns = max(min(fitting, len(lines)), 1)

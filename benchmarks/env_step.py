@@ -1,22 +1,22 @@
-"""An environment step beside its bare physics: `python benchmarks/env_step.py [TASK ...]`, the ten by default."""
+"""An environment step and its bare physics: `python benchmarks/env_step.py [TASK ...]`, by default for all ten tasks."""
 
 from __future__ import annotations
 
-import argparse
+import shared  # isort: skip
+import sys
 
 from pcil.bench.environment import measure_env
 from pcil.envs import TASKS
 
 
-def main() -> None:
-    """Prints microseconds per agent step (two control steps) and their ratio."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tasks", nargs="*", default=TASKS, metavar="TASK")
-    print(f"{'task':<18}{'env step, us':>14}{'physics, us':>14}{'ratio':>8}")
-    for task in parser.parse_args().tasks:
+def main(*tasks: str) -> None:
+    """Print microseconds per agent step (two control steps) and their ratio."""
+    shared.print_row("task", "env step, us", "physics, us", "ratio")
+    for task in tasks or TASKS:
         measured = measure_env(task)
-        print(f"{task:<18}{measured['env_step_us']:>14.1f}{measured['physics_us']:>14.1f}{measured['ratio']:>8.2f}")
+        cells = (f"{measured['env_step_us']:.1f}", f"{measured['physics_us']:.1f}", f"{measured['ratio']:.2f}")
+        shared.print_row(task, *cells)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -1,6 +1,6 @@
-"""Runs side by side: the same runs with one job and with two, and the ratio of their speeds: `python benchmarks/sweep.py`.
+"""The same runs with one job and with two, and the ratio of their throughputs: `python benchmarks/sweep.py`.
 
-Once of whole commands, with the imports of each run, and once of the training alone, as `eval.csv` has it.
+The ratio is computed for the whole commands, which include the imports of each run, and for the training alone (`eval.csv`).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ settings.evaluate_every = {frames}
 
 
 def main() -> None:
-    """Prints seconds and frames a second of one job and of two, and the ratios."""
+    """Print seconds and frames per second with one job and with two, and the ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--frames", type=int, default=30_000)
     parser.add_argument("--task", default="pendulum_swingup")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        sweep(Path(folder) / "compiled", given.task, [0], 2500, jobs=1)  # the others find the compiled programs in the cache
+        sweep(Path(folder) / "compiled", given.task, [0], 2500, jobs=1)  # fills the compilation cache
         seconds = []
         for jobs in (1, 2):
             seconds.append(sweep(Path(folder) / str(jobs), given.task, list(range(given.runs)), given.frames, jobs))
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def sweep(folder: Path, task: str, seeds: list[int], frames: int, jobs: int) -> tuple[float, float]:
-    """Seconds that the command takes, and the mean of those that its runs train."""
+    """The seconds that the command takes, and the mean seconds that its runs train."""
     folder.mkdir()
     (folder / "sweep.toml").write_text(FILE.format(task=task, seeds=seeds, frames=frames))
     words = ["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", str(jobs)]

@@ -1,13 +1,13 @@
-"""Gather the evaluations of finished runs, at any depth, into a small CSV: python experiments/collect.py FILE.csv FOLDER ...
+"""Collect the evaluations of finished runs, at any depth, in a CSV file: python experiments/collect.py FILE.csv FOLDER ...
 
-Rows that the file has of other runs stay.
+Rows of other runs that are already in the file are kept.
 """
 
 import json
 import sys
 from pathlib import Path
 
-from pcil.report.load import flat, place, read_points, read_run, write_points
+from pcil.report.load import flat, read_rows, read_run, sort_key, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training import presets
 from pcil.training.config import renamed
@@ -15,17 +15,17 @@ from pcil.training.config import renamed
 
 def main(target: str, *folders: str) -> None:
     """A run's variant is its preset, and whatever it has changed from it."""
-    points = []
+    rows = []
     for folder in sorted({done.parent for top in folders for done in Path(top).rglob("DONE")}):
         run = renamed(json.loads((folder / "run.json").read_text())["run"])
         now, before = flat(run), flat(presets.make(run["task"], run["method"], run["preset"]).to_json())
         decided = {name for name in before if before[name] is None}  # as the run began
         differing = (name for name in now if now[name] != before.get(name) and name not in {*NO_VARIANT, "frames", *decided})
         told = [f"{name}={now[name]}" for name in differing]
-        points += read_run(folder, ", ".join([run["preset"], *told]))
-    new = {point[:4] for point in points}
-    kept = [point for point in read_points(Path(target)) if point[:4] not in new] if Path(target).exists() else []
-    write_points(Path(target), sorted(kept + points, key=place))
+        rows += read_run(folder, ", ".join([run["preset"], *told]))
+    new = {row[:4] for row in rows}
+    kept = [row for row in read_rows(Path(target)) if row[:4] not in new] if Path(target).exists() else []
+    write_rows(Path(target), sorted(kept + rows, key=sort_key))
 
 
 main(*sys.argv[1:])

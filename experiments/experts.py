@@ -17,7 +17,7 @@ from typing import Any
 from pcil import demos, envs
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
-from pcil.report.load import read_run, write_points
+from pcil.report.load import read_run, write_rows
 from pcil.training import runs
 
 HERE = Path(__file__).parent
@@ -106,7 +106,7 @@ def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int, minim
     shutil.rmtree(target, ignore_errors=True)
     fresh.rename(target)
     dataclasses.replace(policy, info=policy.info | info).save(POLICIES / task)
-    write_points(RESULTS / f"{task}.csv", read_run(folder))
+    write_rows(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
 
 

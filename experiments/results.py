@@ -14,7 +14,7 @@ from pathlib import Path
 
 from pcil.demos import shipped
 from pcil.report import figures, tables
-from pcil.report.load import Collection, Dot, Point, read_points
+from pcil.report.load import Collection, EvalRow, TransitionRow, read_rows
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
@@ -39,7 +39,7 @@ def main(words: list[str]) -> int:
         return int(stale > 0)
     for file in sorted((ROOT / "results").iterdir()):
         found, path = results(file.stem), ROOT / "docs" / "figures" / file.stem
-        _ = figures.clouds(found.dots, path) if found.dots else figures.grid(found.points, path)
+        _ = figures.scatter_grid(found.transitions, path) if found.transitions else figures.grid(found.rows, path)
         print(path.relative_to(ROOT))
     return 0
 
@@ -48,8 +48,10 @@ def main(words: list[str]) -> int:
 def results(name: str) -> Collection:
     """The rows of `results/<name>.csv`, or of all files in `results/<name>/`."""
     files = sorted((ROOT / "results" / name).glob("*.csv")) or [ROOT / "results" / f"{name}.csv"]
-    rows = [row for file in files for row in read_points(file)]
-    return Collection([row for row in rows if isinstance(row, Point)], [row for row in rows if isinstance(row, Dot)], {}, [])
+    rows = [row for file in files for row in read_rows(file)]
+    return Collection(
+        [row for row in rows if isinstance(row, EvalRow)], [row for row in rows if isinstance(row, TransitionRow)], {}, []
+    )
 
 
 def demos_table() -> str:

@@ -245,13 +245,13 @@ def arguments_changed(rng: random.Random) -> list[str]:
 def prepare(place: Path) -> None:
     """What is changed later: a run, a dataset, a file of results and a sweep, all good."""
     from pcil import cli
-    from pcil.report.load import collect, write_points
+    from pcil.report.load import collect, write_rows
     from small import save_point_mass_demos
 
     assert cli.main(f"{TRAIN} --method expert --out {place / 'run'}".split()) == 0
     save_point_mass_demos(place)
     (place / "point_mass-v0").rename(place / "data")
-    write_points(place / "results.csv", collect([place / "run"], lambda settings: settings).points)
+    write_rows(place / "results.csv", collect([place / "run"], lambda settings: settings).rows)
     (place / "sweep.toml").write_text(
         'tasks = ["walker_walk"]\nmethods = ["bc", "pcil"]\nseeds = [1, 2]\nframes = 100\n\n[settings]\n"agent.gamma" = 0.9\n'
     )

@@ -27,13 +27,13 @@ from pcil.nets.networks import Actor
 from pcil.policy import Policy, load_policy
 from pcil.report import representation
 from pcil.report.film import film
-from pcil.report.load import Point, Source
+from pcil.report.load import EvalRow, Source
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 CODE = "import pathlib\npathlib.Path(__file__).with_name('RAN').touch()\nimport pcil.envs\n"
 
 
-POINT = Point(POINT_MASS, "pcil", "default", 1, 0, 0.0, 0.0, 0.0, None, "")
+ROW = EvalRow(POINT_MASS, "pcil", "default", 1, 0, 0.0, 0.0, 0.0, None, "")
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -138,7 +138,7 @@ def test_the_representation_of_a_run_that_names_code_is_left_out(evil: Path) -> 
     run = small_run(task=f"evil_code:{POINT_MASS}", demos=save_point_mass_demos(evil))
     settings = representation.flat({**run.to_json()})
     with pytest.raises(InputError, match=r"The run in .* names code of the module 'evil_code'.*--trust evil_code"):
-        representation.transitions(Source(evil, settings, True), POINT)
+        representation.transitions(Source(evil, settings, True), ROW)
     assert not ran(evil)
 
 
@@ -495,4 +495,4 @@ def test_a_report_restores_no_networks_of_any_size(tmp_path: Path) -> None:
     demos = save_point_mass_demos(tmp_path)
     settings = representation.flat(small_run(demos=demos).to_json()) | {"agent.hidden": 10**6, "agent.absorbing": False}
     with pytest.raises(InputError, match=r"networks of [\d,]+ numbers; at most"):
-        representation.transitions(Source(tmp_path, settings, True), POINT)
+        representation.transitions(Source(tmp_path, settings, True), ROW)

@@ -133,7 +133,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_damaged_run_is_a_note_and_the_others_stay(damage: str, runs: Path, tmp_path: Path) -> None:
     bad = fake_run(tmp_path / "bad", [0.0, 1.0, 2.0], seed=9, correlation=[0.5, 0.5])
     whole = load.collect([runs])
-    assert len(load.collect([bad]).points) == 3
+    assert len(load.collect([bad]).rows) == 3
     DAMAGES[damage](bad)
     found = load.collect([bad, runs])
     (note,) = found.notes
@@ -152,7 +152,7 @@ def test_the_page_and_the_terminal_say_what_is_left_out(capsys: pytest.CaptureFi
     assert last == "Report: out/index.html" and len(notes) == len(DAMAGES) + 1
     words = Page(Path("out/index.html").read_text()).words
     assert [note for note in notes if not (note.startswith("left out: runs/") and note in words)] == []
-    assert load.read_points(Path("out/tables/evaluations.csv")) == load.read_run(good)
+    assert load.read_rows(Path("out/tables/evaluations.csv")) == load.read_run(good)
     assert {path.name for path in Path("out/figures").glob("*.png")} == {"curves.png", "curves-walker_run.png", "aggregate.png"}
 
 
@@ -164,9 +164,9 @@ def test_half_a_line_takes_its_evaluation_with_it(tmp_path: Path) -> None:
         (run / "eval.csv").write_text(text[:-lost])
         found = load.collect([run])
         if lost == half:  # a whole line is missing, which nobody can see
-            assert len(found.points) == 3 and found.notes == []
+            assert len(found.rows) == 3 and found.notes == []
         else:
-            assert [point.return_mean for point in found.points] == [1.0, 2.0]
+            assert [row.return_mean for row in found.rows] == [1.0, 2.0]
             assert found.notes == [f"left out: {run}, the end of eval.csv, whose last line is half written"]
 
 
@@ -176,10 +176,10 @@ def test_settings_of_every_kind_are_shown(tmp_path: Path) -> None:
     fake_run(tmp_path / "a", [1.0], odd=value)
     fake_run(tmp_path / "b", [1.0], odd=value[::-1])
     found = load.collect([tmp_path])
-    assert len({point.variant for point in found.points}) == 2
+    assert len({row.variant for row in found.rows}) == 2
     text = page.build(found, tmp_path / "out", {}).read_text()
     assert "<b>" not in text and "\x1b" not in text and len(text) < 1e6
-    assert load.collect([tmp_path / "out" / "tables" / "evaluations.csv"]).points == found.points
+    assert load.collect([tmp_path / "out" / "tables" / "evaluations.csv"]).rows == found.rows
 
 
 class Page(HTMLParser):
@@ -200,7 +200,7 @@ class Page(HTMLParser):
 
 def test_names_are_shown_as_they_are_and_do_nothing(tmp_path: Path) -> None:
     """As task, method, preset, setting, commit and folder: the page has the elements that it has of plain names."""
-    dots = tmp_path / "dots.csv"
+    transitions = tmp_path / "transitions.csv"
     for side, names in (("plain", ["plain"] * len(HOSTILE)), ("odd", HOSTILE)):
         for i, name in enumerate(names):
             folder = fake_run(
@@ -208,9 +208,11 @@ def test_names_are_shown_as_they_are_and_do_nothing(tmp_path: Path) -> None:
             )
             told(folder, "commit", value=name)
             told(folder, "run", "preset", value=name)
-        rows = load.collect([tmp_path / side]).points
-        load.write_points(dots, [load.Dot(*rows[0][:5], reward, 0.1, 0.2, 0.3, 0.4) for reward in (None, 1.0, 2.0)])
-        page.build(load.collect([tmp_path / side, dots]), tmp_path / f"{side}-out", {f"{rows[0].task} film": b""})
+        rows = load.collect([tmp_path / side]).rows
+        load.write_rows(
+            transitions, [load.TransitionRow(*rows[0][:5], reward, 0.1, 0.2, 0.3, 0.4) for reward in (None, 1.0, 2.0)]
+        )
+        page.build(load.collect([tmp_path / side, transitions]), tmp_path / f"{side}-out", {f"{rows[0].task} film": b""})
     plain, odd = (Page((tmp_path / f"{side}-out" / "index.html").read_text()) for side in ("plain", "odd"))
     assert (odd.tags, odd.attributes) == (plain.tags, plain.attributes) and "script" not in odd.tags
     assert all(f"{name}{i}" in odd.words for i, name in enumerate(HOSTILE))

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
 from pcil.report import figures
-from pcil.report.load import Dot, Point
+from pcil.report.load import EvalRow, TransitionRow
 from pcil.training import presets
 
 EVALUATIONS = """\
@@ -52,10 +52,10 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Axes]]:
 
 def curve(
     task: str, method: str, seed: int, *means: float, variant: str = "default", expert: float | None = 9.0
-) -> list[Point]:
+) -> list[EvalRow]:
     """One evaluation every 1000 frames."""
     triples = [(float(mean), mean - 1.0, mean + 1.0) for mean in means]
-    return [Point(task, method, variant, seed, 1000 * i, *triple, expert, "abc") for i, triple in enumerate(triples)]
+    return [EvalRow(task, method, variant, seed, 1000 * i, *triple, expert, "abc") for i, triple in enumerate(triples)]
 
 
 def lines(axes: Axes) -> dict[str, list[float]]:
@@ -106,8 +106,8 @@ def test_axes_begin_at_zero_except_where_returns_are_below(run: Path, drawn: lis
 
 
 def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:
-    points = curve("one", "pcil", 1, 1, 2, 3) + curve("two", "a new method", 1, 1, 1, expert=None)
-    svg = figures.grid(points, tmp_path / "deep" / "all")
+    rows = curve("one", "pcil", 1, 1, 2, 3) + curve("two", "a new method", 1, 1, 1, expert=None)
+    svg = figures.grid(rows, tmp_path / "deep" / "all")
     path = tmp_path / "deep" / "all.png"
     assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
     assert svg.startswith("<?xml") and svg.rstrip().endswith("</svg>")
@@ -119,7 +119,7 @@ def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:
 def test_a_long_legend_takes_nothing_from_the_panels(tmp_path: Path, drawn: list[Axes]) -> None:
     """Twenty variants in one column, on paper that grows with them."""
     few, many = (
-        [point for i in range(count) for point in curve("task", "pcil", 1, 1, 2, variant=f"default, some.setting_of_a_run={i}")]
+        [row for i in range(count) for row in curve("task", "pcil", 1, 1, 2, variant=f"default, some.setting_of_a_run={i}")]
         for count in (2, 20)
     )
     figures.grid(few, tmp_path / "few")
@@ -145,9 +145,9 @@ def test_one_seed_has_no_band(tmp_path: Path, drawn: list[Axes]) -> None:
 
 
 def test_a_grid_tells_variants_and_tasks_apart(tmp_path: Path, drawn: list[Axes]) -> None:
-    points = curve("a", "pcil", 1, 1) + curve("a", "pcil", 1, 2, variant="paper") + curve("a", "dac", 1, 3)
-    points += [point for task in "bc" for point in curve(task, "dac", 1, 4, expert=None)]
-    figures.grid(points, tmp_path / "grid", columns=2)
+    rows = curve("a", "pcil", 1, 1) + curve("a", "pcil", 1, 2, variant="paper") + curve("a", "dac", 1, 3)
+    rows += [row for task in "bc" for row in curve(task, "dac", 1, 4, expert=None)]
+    figures.grid(rows, tmp_path / "grid", columns=2)
     titles = ["a, 1 seed", "b, 1 seed", "c, 1 seed"]
     assert [axes.get_title() for axes in drawn if axes.axison] == titles and len(drawn) == 4
     names = {"pcil, default": [1], "pcil, paper": [2], "dac": [3], "demos": [9, 9]}
@@ -159,7 +159,7 @@ def test_a_grid_tells_variants_and_tasks_apart(tmp_path: Path, drawn: list[Axes]
 
 
 def test_health_is_drawn_where_it_is_known(tmp_path: Path, drawn: list[Axes]) -> None:
-    known = [point._replace(correlation=0.1 * i) for i, point in enumerate(curve("a", "pcil", 1, 1, 2, 3))]
+    known = [row._replace(correlation=0.1 * i) for i, row in enumerate(curve("a", "pcil", 1, 1, 2, 3))]
     figures.grid(known + curve("b", "bc", 1, 5, 6), tmp_path / "grid", value="correlation")
     (axes,) = drawn
     assert np.allclose(lines(axes)["pcil"], [0, 0.1, 0.2]) and "correlation" in axes.get_ylabel()
@@ -168,10 +168,10 @@ def test_health_is_drawn_where_it_is_known(tmp_path: Path, drawn: list[Axes]) ->
 
 def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) -> None:
     """Four seeds with 0.5, 0.7, 0.3 and 1 of their experts at the end: without the lowest and the highest, 0.6."""
-    points = curve("a", "pcil", 1, 0, 5, expert=10.0) + curve("a", "pcil", 2, 0, 7, expert=10.0)
-    points += curve("b", "pcil", 1, 0, 6, expert=20.0) + curve("b", "pcil", 2, 0, 20, expert=20.0)
-    points += curve("c", "dac", 1, 3, 4, expert=None)
-    figures.aggregate(points, tmp_path / "all", figures.styles(points))
+    rows = curve("a", "pcil", 1, 0, 5, expert=10.0) + curve("a", "pcil", 2, 0, 7, expert=10.0)
+    rows += curve("b", "pcil", 1, 0, 6, expert=20.0) + curve("b", "pcil", 2, 0, 20, expert=20.0)
+    rows += curve("c", "dac", 1, 3, 4, expert=None)
+    figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows))
     (axes,) = drawn
     assert np.allclose(lines(axes)["pcil"], [0, 0.6]) and axes.get_title() == "2 tasks" and "dac" not in lines(axes)
     assert np.allclose(axes.collections[0].get_datalim(axes.transData).intervaly, [0, 0.85])
@@ -179,23 +179,23 @@ def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) 
 
 def test_a_method_without_steps_is_a_level_line(tmp_path: Path, drawn: list[Axes]) -> None:
     """At the mean of its seeds' last returns; together with other tasks at its share."""
-    points = curve("a", "bc", 1, 0, 1, 4) + curve("a", "bc", 2, 0, 1, 6)
-    points += curve("a", "pcil", 1, 0, 9) + curve("b", "pcil", 1, 0, 9)
-    figures.grid(points, tmp_path / "grid", columns=2)
-    figures.aggregate(points, tmp_path / "all", figures.styles(points))
+    rows = curve("a", "bc", 1, 0, 1, 4) + curve("a", "bc", 2, 0, 1, 6)
+    rows += curve("a", "pcil", 1, 0, 9) + curve("b", "pcil", 1, 0, 9)
+    figures.grid(rows, tmp_path / "grid", columns=2)
+    figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows))
     assert lines(drawn[0])["bc"] == [5, 5] and drawn[0].get_title() == "a, 1 to 2 seeds"
     assert lines(drawn[2]) == {"pcil (2 tasks)": [0, 1], "bc (1 task)": [pytest.approx(5 / 9)] * 2, "demos": [1, 1]}
 
 
 def test_without_an_expert_there_is_nothing_to_put_together(tmp_path: Path) -> None:
-    points = curve("a", "pcil", 1, 0, 5, expert=None)
-    assert figures.aggregate(points, tmp_path / "all", figures.styles(points)) == "" and not list(tmp_path.iterdir())
+    rows = curve("a", "pcil", 1, 0, 5, expert=None)
+    assert figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows)) == "" and not list(tmp_path.iterdir())
 
 
 def test_the_same_grid_is_the_same_file(tmp_path: Path) -> None:
     """Committed figures change only where their numbers do."""
-    points = curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6)
-    one, two = (figures.grid(points, tmp_path / name / "grid") for name in "ab")
+    rows = curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6)
+    one, two = (figures.grid(rows, tmp_path / name / "grid") for name in "ab")
     assert one == two
     for kind in ("png", "pdf"):
         first, second = ((tmp_path / name / f"grid.{kind}").read_bytes() for name in "ab")
@@ -213,20 +213,20 @@ def luminance(colour: str) -> float:
 
 
 def test_every_method_has_a_look_and_can_be_told_without_colour() -> None:
-    looks = [*figures.STYLES.values(), *figures.OTHERS]
+    looks = [*figures.STYLES.values(), *figures.SPARE_STYLES]
     assert set(figures.STYLES) >= set(presets.METHODS) | {"pwil", "sil", "tcn", "pcil-gail", "tcn-gail", "potil"}
     assert len({look.marker for look in looks}) == len({look.colour for look in looks}) == len(looks)
     assert len({look.dashes for look in figures.STYLES.values()}) == len(figures.STYLES)
 
 
-@pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.OTHERS)])
+@pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.SPARE_STYLES)])
 def test_lines_stand_out_from_the_paper(colour: str) -> None:
     assert 1.05 / (luminance(colour) + 0.05) > 3, "WCAG's least contrast of graphical objects"
 
 
 def test_a_look_does_not_depend_on_who_else_is_there() -> None:
-    everyone = [point for method in ("dac", "zzz", "pcil", "aaa") for point in curve("a", method, 1, 1)]
-    looks = figures.styles(everyone + curve("a", "pcil", 1, 1, variant="paper"))
+    everyone = [row for method in ("dac", "zzz", "pcil", "aaa") for row in curve("a", method, 1, 1)]
+    looks = figures.assign_styles(everyone + curve("a", "pcil", 1, 1, variant="paper"))
     assert looks["pcil", "default"] == figures.STYLES["pcil"] and looks["dac", "default"] == figures.STYLES["dac"]
     assert len(set(looks.values())) == 5 and list(looks)[:3] == [("pcil", "default"), ("pcil", "paper"), ("dac", "default")]
 
@@ -237,18 +237,18 @@ def test_a_look_does_not_depend_on_who_else_is_there() -> None:
 def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes]) -> None:
     """A row a method, a column a task; one panel is missing; of two seeds the first is drawn."""
 
-    def transitions(task: str, method: str, seed: int, shift: float) -> list[Dot]:
+    def make_transitions(task: str, method: str, seed: int, shift: float) -> list[TransitionRow]:
         head = (task, method, "default", seed, 5000)
         return [
-            Dot(*head, None, 0.0, 0.5, shift, 0.0),
-            Dot(*head, 0.0, 1.0, 0.5, shift + 1, 1.0),
-            Dot(*head, 2.0, 3.0, 0.5, shift + 2, 3.0),
+            TransitionRow(*head, None, 0.0, 0.5, shift, 0.0),
+            TransitionRow(*head, 0.0, 1.0, 0.5, shift + 1, 1.0),
+            TransitionRow(*head, 2.0, 3.0, 0.5, shift + 2, 3.0),
         ]
 
-    dots = transitions("a", "dac", 1, 10) + transitions("a", "dac", 2, 50)
-    dots += transitions("a", "pcil", 1, 20) + transitions("b", "pcil", 1, 30)
-    dots += [Dot("a", "pcil", "default", 1, 5000, 5.0, 1.0, 0.5, 20.0, 9.0)]
-    figures.clouds(dots, tmp_path / "clouds")
+    transitions = make_transitions("a", "dac", 1, 10) + make_transitions("a", "dac", 2, 50)
+    transitions += make_transitions("a", "pcil", 1, 20) + make_transitions("b", "pcil", 1, 30)
+    transitions += [TransitionRow("a", "pcil", "default", 1, 5000, 5.0, 1.0, 0.5, 20.0, 9.0)]
+    figures.scatter_grid(transitions, tmp_path / "clouds")
     panels = [axes for axes in drawn if axes.get_title()]
     assert [axes.get_title().split(",")[:2] for axes in panels] == [["a", " dac"], ["a", " pcil"], ["b", " pcil"]]
     (agent,), (expert,) = panels[0].collections, panels[0].lines

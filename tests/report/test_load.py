@@ -10,7 +10,7 @@ import pytest
 
 from fake_runs import fake_run, fake_sweep
 from pcil.errors import InputError
-from pcil.report.load import Dot, Point, collect, curves, flat, label, matrix, read_points, read_run, write_points
+from pcil.report.load import EvalRow, TransitionRow, by_variant, collect, flat, label, matrix, read_rows, read_run, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training.config import MACHINE_SETTINGS
 
@@ -27,13 +27,13 @@ def make_run(folder: Path) -> Path:
     return folder
 
 
-def test_each_evaluation_is_one_point(tmp_path: Path) -> None:
+def test_each_evaluation_is_one_row(tmp_path: Path) -> None:
     """The correlation is that of the episodes since the evaluation before which have one: null is none, and so is the 0 of
     older logs. Half a line of a killed run is no episode."""
-    points = read_run(make_run(tmp_path / "run"))
-    assert points == [
-        Point("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.456, "abc+", 0.1, None),
-        Point("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.456, "abc+", 9.9, 0.375),
+    rows = read_run(make_run(tmp_path / "run"))
+    assert rows == [
+        EvalRow("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.456, "abc+", 0.1, None),
+        EvalRow("walker_walk", "pcil", "default", 3, 20000, 10.5, 10.25, 10.75, 947.456, "abc+", 9.9, 0.375),
     ]
 
 
@@ -41,29 +41,32 @@ def test_a_run_without_episodes_has_no_correlation(tmp_path: Path) -> None:
     """Behavioural cloning plays none while it trains."""
     folder = make_run(tmp_path / "run")
     (folder / "train.jsonl").write_text('{"frames": 1000, "agent/loss": 1.0}\n')
-    assert {point.correlation for point in read_run(folder)} == {None}
+    assert {row.correlation for row in read_run(folder)} == {None}
 
 
 def test_rows_survive_their_file(tmp_path: Path) -> None:
-    points = [*read_run(make_run(tmp_path / "run"), "warm"), Point("t", "expert", "default", 1, 0, 0.0, 0.0, 0.0, None, "")]
-    dots = [Dot("t", "dac", "paper", 2, 9, None, 0.1, -0.5, 1.0, 2.0), Dot("t", "dac", "paper", 2, 9, 1.5, 0.0, 1.0, 0.0, 0.0)]
-    for rows in (points, dots):
-        write_points(tmp_path / "results" / "x.csv", rows)
-        assert read_points(tmp_path / "results" / "x.csv") == rows
+    rows = [*read_run(make_run(tmp_path / "run"), "warm"), EvalRow("t", "expert", "default", 1, 0, 0.0, 0.0, 0.0, None, "")]
+    transitions = [
+        TransitionRow("t", "dac", "paper", 2, 9, None, 0.1, -0.5, 1.0, 2.0),
+        TransitionRow("t", "dac", "paper", 2, 9, 1.5, 0.0, 1.0, 0.0, 0.0),
+    ]
+    for written in (rows, transitions):
+        write_rows(tmp_path / "results" / "x.csv", written)
+        assert read_rows(tmp_path / "results" / "x.csv") == written
 
 
 def test_files_of_older_versions_are_read(tmp_path: Path) -> None:
-    write_points(tmp_path / "x.csv", points := read_run(make_run(tmp_path / "run")))
+    write_rows(tmp_path / "x.csv", rows := read_run(make_run(tmp_path / "run")))
     cut = [",".join(line.split(",")[:10]) for line in (tmp_path / "x.csv").read_text().splitlines()]
     (tmp_path / "x.csv").write_text("\n".join(cut) + "\n")
-    assert read_points(tmp_path / "x.csv") == [point._replace(seconds=None, correlation=None) for point in points]
+    assert read_rows(tmp_path / "x.csv") == [row._replace(seconds=None, correlation=None) for row in rows]
 
 
 @pytest.mark.parametrize("text", ["a,b\n1,2\n", "task,method\nx,y\n", "task,frames\nx,many\n", "\x00\x01\xff"])
 def test_a_file_of_something_else_is_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_bytes(text.encode("latin-1"))
-    with pytest.raises(InputError, match="is no file of results"):
-        read_points(tmp_path / "x.csv")
+    with pytest.raises(InputError, match="is not a file of results"):
+        read_rows(tmp_path / "x.csv")
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
@@ -75,7 +78,7 @@ def test_a_run_without_demonstrations_has_no_expert(tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run")
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"demos": None, "commit": None}))
-    assert {(point.expert_return, point.commit) for point in read_run(folder)} == {(None, "")}
+    assert {(row.expert_return, row.commit) for row in read_run(folder)} == {(None, "")}
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"run": [], "demos": null, "commit": null}'])
@@ -92,24 +95,24 @@ def test_a_damaged_description_is_refused(text: str, tmp_path: Path) -> None:
 def test_runs_are_found_at_any_depth_and_once(tmp_path: Path) -> None:
     root = fake_sweep(tmp_path / "sweep")
     found = collect([root, root / "walker_run", root / "walker_run" / "pcil-1"])
-    assert len(found.sources) == 12 and len(found.points) == 36 and found.notes == []
+    assert len(found.sources) == 12 and len(found.rows) == 36 and found.notes == []
     assert found.sources["walker_run", "pcil", "default", 2].folder == root / "walker_run" / "pcil-2"
     assert found.sources["walker_run", "pcil", "default", 2].settings["agent.gamma"] == 0.99
 
 
 def test_the_order_of_the_paths_changes_nothing(tmp_path: Path) -> None:
     root = fake_sweep(tmp_path)
-    one, two = (collect(sorted(root.glob("*/*"), reverse=reverse)).points for reverse in (False, True))
+    one, two = (collect(sorted(root.glob("*/*"), reverse=reverse)).rows for reverse in (False, True))
     assert one == two
-    assert [name[:2] for name in curves(one)] == [(t, m) for t in ("hopper_stand", "walker_run") for m in ("pcil", "dac")]
+    assert [name[:2] for name in by_variant(one)] == [(t, m) for t in ("hopper_stand", "walker_run") for m in ("pcil", "dac")]
 
 
-def test_a_csv_gives_the_same_points_as_its_runs(tmp_path: Path) -> None:
+def test_a_csv_gives_the_same_rows_as_its_runs(tmp_path: Path) -> None:
     found = collect([fake_sweep(tmp_path / "sweep")])
-    write_points(tmp_path / "all.csv", found.points)
+    write_rows(tmp_path / "all.csv", found.rows)
     again = collect([tmp_path / "all.csv"])
-    assert again.points == found.points and again.sources == {}
-    assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).points == found.points, "no seed counts twice"
+    assert again.rows == found.rows and again.sources == {}
+    assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).rows == found.rows, "no seed counts twice"
 
 
 def test_a_run_in_two_files_is_whole_and_of_the_first(tmp_path: Path) -> None:
@@ -117,9 +120,9 @@ def test_a_run_in_two_files_is_whole_and_of_the_first(tmp_path: Path) -> None:
     short, long = tmp_path / "short.csv", tmp_path / "long.csv"
     for seed, path, returns in ((1, short, [1, 2]), (2, long, [3, 4, 5])):
         runs = [fake_run(tmp_path / f"a{seed}", returns), fake_run(tmp_path / f"b{seed}", [9], method="dac", seed=seed)]
-        write_points(path, collect(runs).points)
+        write_rows(path, collect(runs).rows)
     both = collect([short, long])
-    assert [point.return_mean for point in both.points] == [1, 2, 9, 9], "DAC's two seeds are of one file each"
+    assert [row.return_mean for row in both.rows] == [1, 2, 9, 9], "DAC's two seeds are of one file each"
     assert both.notes == [f"{long} holds runs that {short} has too; those of the latter are shown."]
 
 
@@ -130,7 +133,7 @@ def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path
     fake_run(tmp_path / "c", [3], seed=1, agent={"gamma": 0.9})
     fake_run(tmp_path / "d", [4], "hopper_hop", n_step=1)
     fake_run(tmp_path / "e", [5], method="dac", n_step=1)
-    by = {(point.task, point.method, point.variant, point.seed): point.return_mean for point in collect([tmp_path]).points}
+    by = {(row.task, row.method, row.variant, row.seed): row.return_mean for row in collect([tmp_path]).rows}
     assert by == {
         ("walker_run", "pcil", "default", 1): 1,
         ("walker_run", "pcil", "default", 2): 2,
@@ -143,7 +146,7 @@ def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path
 def test_where_no_value_is_the_usual_one_all_are_told(tmp_path: Path) -> None:
     fake_run(tmp_path / "a", [1], agent={"gamma": 0.99})
     fake_run(tmp_path / "b", [2], agent={"gamma": 0.9})
-    assert {point.variant for point in collect([tmp_path]).points} == {"default, agent.gamma=0.9", "default, agent.gamma=0.99"}
+    assert {row.variant for row in collect([tmp_path]).rows} == {"default, agent.gamma=0.9", "default, agent.gamma=0.99"}
 
 
 @pytest.mark.parametrize(
@@ -157,7 +160,7 @@ def test_a_budget_that_differs_on_one_task_makes_two_rows_of_a_method(
     fake_run(tmp_path / "a", [1], "hopper_hop", frames=first)
     fake_run(tmp_path / "b", [2], "hopper_hop", frames=second)
     fake_run(tmp_path / "c", [3], "walker_run", frames=third)
-    by = {(point.task, point.return_mean): point.variant for point in collect([tmp_path]).points}
+    by = {(row.task, row.return_mean): row.variant for row in collect([tmp_path]).rows}
     assert by["walker_run", 3] == "default" and by["hopper_hop", 2] == longer and len(set(by.values())) == 2
 
 
@@ -176,7 +179,7 @@ def test_the_same_run_twice_is_shown_once_and_said(tmp_path: Path) -> None:
     for name in ("a", "b"):
         fake_run(tmp_path / name, [1, 2])
     found = collect([tmp_path])
-    assert len(found.points) == 2
+    assert len(found.rows) == 2
     assert found.notes == [f"{tmp_path / 'b'} holds the same run as {tmp_path / 'a'}, which is shown."]
 
 
@@ -206,7 +209,7 @@ def test_without_any_run_the_reason_is_given(tmp_path: Path) -> None:
 def test_a_matrix_has_the_frames_that_all_seeds_have(tmp_path: Path) -> None:
     fake_run(tmp_path / "a", {0: 1, 1000: 2, 2000: 3}, correlation=[0.5, 0.6])
     fake_run(tmp_path / "b", {0: 4, 2000: 5, 3000: 6}, seed=2, correlation=[0.7, 0.8])
-    (runs,) = curves(collect([tmp_path]).points).values()
+    (runs,) = by_variant(collect([tmp_path]).rows).values()
     frames, values = matrix(runs)
     assert frames.tolist() == [0, 2000] and values.tolist() == [[1, 3], [4, 5]]
     frames, values = matrix(runs, "correlation")
@@ -226,7 +229,7 @@ def test_nested_settings_are_flat_by_their_dotted_names() -> None:
 def test_without_rows_a_file_stays_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text("old")
     with pytest.raises(InputError, match="no rows"):
-        write_points(tmp_path / "x.csv", [])
+        write_rows(tmp_path / "x.csv", [])
     assert (tmp_path / "x.csv").read_text() == "old"
 
 
@@ -234,4 +237,4 @@ def test_seeds_without_frames_in_common_are_not_averaged(tmp_path: Path) -> None
     fake_run(tmp_path / "a", {1000: 5}, seed=1)
     fake_run(tmp_path / "b", {2000: 6}, seed=2)
     found = collect([tmp_path])
-    assert {point.seed for point in found.points} == {1} and "no frames in common; only seed 1" in found.notes[0]
+    assert {row.seed for row in found.rows} == {1} and "no frames in common; only seed 1" in found.notes[0]

@@ -17,7 +17,7 @@ from PIL import Image
 from fake_runs import fake_run, fake_sweep
 from pcil.errors import InputError
 from pcil.report import load, page
-from pcil.report.load import Collection, Dot
+from pcil.report.load import Collection, TransitionRow
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = "--no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update --disable-sync"
@@ -38,7 +38,7 @@ def everything(folder: Path) -> Collection:
     rng = np.random.default_rng(0)
     for task, method, variant, seed in sorted(found.sources, key=lambda name: (name[0], name[1] != "pcil", *name)):
         for reward in [None] * 8 + rng.random(16).tolist():
-            found.dots.append(Dot(task, method, variant, seed, 2000, reward, *rng.random(4).tolist()))
+            found.transitions.append(TransitionRow(task, method, variant, seed, 2000, reward, *rng.random(4).tolist()))
     return found
 
 
@@ -105,7 +105,7 @@ def test_it_says_what_was_found(report: Path) -> None:
     words = Page(report.read_text()).words
     assert "13 runs: " in words and "A run is left out & said so." in words
     assert "<b>my.module:Mine</b>" in words, "a name is shown as it is written"
-    for title in ("Final return of each task", "Beside the paper's numbers", "Sample efficiency", "Health of the learned"):
+    for title in ("Final return of each task", "Comparison with the paper", "Sample efficiency", "Health of the learned"):
         assert title in words
     assert "200.0 [-48.4,\u00a0448.4]" in words and "agent.gamma: 0.99" in words and "commit: 0123456789abcdef" in words
     assert words.count("not finished") == 1
@@ -192,6 +192,6 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
     assert "mine.txt" in names and "curves-hopper_hop.png" in names and not any("walker_run" in name for name in names)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "index.html").write_text("<title>mine</title>")
-    with pytest.raises(InputError, match="something else than a report"):
+    with pytest.raises(InputError, match="something other than a report"):
         page.clear(tmp_path / "site")
     assert (tmp_path / "site" / "index.html").read_text() == "<title>mine</title>"

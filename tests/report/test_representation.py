@@ -82,13 +82,13 @@ def test_rows_are_added_for_every_run_that_has_a_representation(trained: Path, f
     before = files(trained)
     representation.add(found)
     assert files(trained) == before and found.notes == []
-    assert [dot.method for dot in found.dots] == ["pcil"] * 178 + ["dac"] * 178
+    assert [row.method for row in found.transitions] == ["pcil"] * 178 + ["dac"] * 178
     for method in ("pcil", "dac"):
-        mine = [dot for dot in found.dots if dot.method == method]
-        assert sum(dot.reward is None for dot in mine) == 128 and {dot.frames for dot in mine} == {300}
+        mine = [row for row in found.transitions if row.method == method]
+        assert sum(row.reward is None for row in mine) == 128 and {row.frames for row in mine} == {300}
     again = collect([trained])
     representation.add(again)
-    assert again.dots == found.dots
+    assert again.transitions == found.transitions
 
 
 def test_the_transitions_are_those_of_the_newest_networks(
@@ -105,7 +105,7 @@ def test_the_transitions_are_those_of_the_newest_networks(
     monkeypatch.setattr(representation, "play", watched)
     monkeypatch.setattr(learner, "update", lambda *arguments: pytest.fail("an update"))
     name = ("toy/point_mass-v0", "pcil", "default", 1)
-    dots = representation.transitions(found.sources[name], next(point for point in found.points if point[:4] == name))
+    rows = representation.transitions(found.sources[name], next(row for row in found.rows if row[:4] == name))
     state, run = kept["state"].learner, small_run(demos=str(trained / "demos" / "point_mass-v0"))
     assert kept["state"].counters.updates == json.loads((trained / "pcil/train.jsonl").read_text().splitlines()[-1])["updates"]
 
@@ -119,8 +119,8 @@ def test_the_transitions_are_those_of_the_newest_networks(
     order = rng.permutation(50)
     agent = look(kept["episodes"][0].obs[1:][order])
     distances = np.linalg.norm(np.concatenate([expert, agent]) - expert.mean(axis=0), axis=1)
-    assert [dot.distance for dot in dots] == pytest.approx(distances.tolist(), rel=1e-3, abs=1e-5)
-    assert [dot.reward for dot in dots[128:]] == pytest.approx(kept["episodes"][0].reward[order].tolist(), rel=1e-3)
+    assert [row.distance for row in rows] == pytest.approx(distances.tolist(), rel=1e-3, abs=1e-5)
+    assert [row.reward for row in rows[128:]] == pytest.approx(kept["episodes"][0].reward[order].tolist(), rel=1e-3)
 
 
 def test_a_run_is_made_again_from_its_description(trained: Path) -> None:
@@ -154,7 +154,7 @@ def test_what_is_not_ours_is_never_made(change: dict[str, Any], trained: Path, t
     (folder / "run.json").write_text(json.dumps(about))
     found = collect([folder])
     representation.add(found)
-    assert found.dots == [] and len(found.notes) == 1 and "1 of 1 runs is left out" in found.notes[0]
+    assert found.transitions == [] and len(found.notes) == 1 and "1 of 1 runs is left out" in found.notes[0]
 
 
 @pytest.mark.parametrize("damage", ["gone", "torn", "narrow"])
@@ -172,10 +172,10 @@ def test_a_run_without_its_networks_is_left_out_and_said(damage: str, trained: P
     found = collect([folder])
     with contextlib.redirect_stdout(io.StringIO()) as said:
         representation.add(found)
-    assert said.getvalue() == "" and found.dots == []
+    assert said.getvalue() == "" and found.transitions == []
     assert found.notes[0].startswith("The representation of 1 of 1 runs is left out: ")
     with pytest.raises(InputError):
-        representation.transitions(next(iter(found.sources.values())), found.points[-1])
+        representation.transitions(next(iter(found.sources.values())), found.rows[-1])
 
 
 def test_no_step_is_drawn_twice_and_each_keeps_its_reward() -> None:

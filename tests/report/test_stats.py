@@ -151,7 +151,7 @@ def test_each_column_of_a_curve_has_its_own_interval() -> None:
 def test_the_way_to_a_share_of_the_expert_is_the_first_evaluation_there(tmp_path: Path) -> None:
     run = read_run(fake_run(tmp_path / "run", [0, 390, 450, 300, 640], expert=800))
     reached = [stats.first_reach(run, share) for share in (0.5, 0.8, 0.9)]
-    assert [point and (point.frames, point.seconds) for point in reached] == [(2000, 60.0), (4000, 120.0), None]
+    assert [row and (row.frames, row.seconds) for row in reached] == [(2000, 60.0), (4000, 120.0), None]
 
 
 @pytest.mark.parametrize("expert", [None, 0.0, -100.0])

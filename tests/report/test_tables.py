@@ -10,7 +10,7 @@ import pytest
 
 from fake_runs import fake_run, fake_sweep
 from pcil.report import tables
-from pcil.report.load import Collection, Dot, collect
+from pcil.report.load import Collection, TransitionRow, collect
 from pcil.report.stats import Interval
 
 
@@ -134,8 +134,8 @@ def test_methods_without_an_evaluation_in_common_are_not_compared(tmp_path: Path
     fake_run(tmp_path / "a", [1.0, 2.0], method="pcil")
     fake_run(tmp_path / "b", [3.0, 4.0], method="dac")
     found = collect([tmp_path])
-    moved = [point._replace(frames=point.frames + 7) if point.method == "dac" else point for point in found.points]
-    assert len(tables.improvement(found).rows) == 1 and tables.improvement(found._replace(points=moved)).rows == []
+    moved = [row._replace(frames=row.frames + 7) if row.method == "dac" else row for row in found.rows]
+    assert len(tables.improvement(found).rows) == 1 and tables.improvement(found._replace(rows=moved)).rows == []
 
 
 def test_health(sweep: Collection) -> None:
@@ -154,12 +154,12 @@ def test_a_seed_that_is_behind_shortens_the_comparison(tmp_path: Path) -> None:
 
 def test_representation() -> None:
     """Distances 1, 2, 3 with rewards 3, 2, 1 and 1, 3, 2 have the rank correlations -1 and 0.5."""
-    dots = []
+    transitions = []
     for seed, rewards in ((1, (3.0, 2.0, 1.0)), (2, (1.0, 3.0, 2.0))):
         head = ("hopper_hop", "pcil", "paper", seed, 500)
-        dots += [Dot(*head, None, 0.0, silhouette, 0.0, 0.0) for silhouette in (0.5, 0.7 + seed / 10)]
-        dots += [Dot(*head, reward, distance, -1.0, 0.0, 0.0) for distance, reward in enumerate(rewards, 1)]
-    ((*name, spearman, each, silhouette, of_each),) = tables.representation(Collection([], dots, {}, [])).rows
+        transitions += [TransitionRow(*head, None, 0.0, silhouette, 0.0, 0.0) for silhouette in (0.5, 0.7 + seed / 10)]
+        transitions += [TransitionRow(*head, reward, distance, -1.0, 0.0, 0.0) for distance, reward in enumerate(rewards, 1)]
+    ((*name, spearman, each, silhouette, of_each),) = tables.representation(Collection([], transitions, {}, [])).rows
     assert name == ["hopper_hop", "pcil", "paper"] and each == "1: -1.00, 2: 0.50" and of_each == "1: 0.65, 2: 0.70"
     assert spearman.value == pytest.approx(-0.25) and silhouette.value == pytest.approx(0.675)
 
@@ -188,7 +188,7 @@ def test_a_csv_has_every_number(sweep: Collection, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", list(tables.MAKERS))
 def test_every_table_has_a_title_a_note_and_columns_of_its_own(name: str, sweep: Collection) -> None:
-    title, note = tables.words(tables.MAKERS[name])
-    assert 5 < len(title) < 40 and note.endswith(".") and len(note) > 40
+    title, caption = tables.title_and_caption(tables.MAKERS[name])
+    assert 5 < len(title) < 40 and caption.endswith(".") and len(caption) > 40
     table = tables.MAKERS[name](sweep)
     assert len(set(table.header)) == len(table.header) and all(len(row) == len(table.header) for row in table.rows)

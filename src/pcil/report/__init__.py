@@ -1,1 +1,1 @@
-"""Pictures and tables from run folders and CSV files; nothing here imports JAX."""
+"""Figures and tables from run folders and CSV files. Only `representation` and `film` import JAX."""

@@ -1,4 +1,4 @@
-"""Policies at work, as short animations, where the machine can render."""
+"""Short animations of policies, if the machine can render."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pcil.training.evaluate import playable
 
 
 def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
-    """An animation by the first seed of each task, method and variant, under a title; one note of those that can't be made."""
+    """Animations of the first seed of each task, method and variant, by title; one note covers those that can't be made."""
     first = {name[:3]: name for name in sorted(found.sources, reverse=True)}
     made: dict[str, bytes] = {}
     refused: list[str] = []
     for name in sorted(first.values()):
         try:
             made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder, trust)
-        except Exception as error:  # whatever OpenGL raises where it does not work
+        except Exception as error:  # OpenGL can raise anything where it does not work
             refused.append(named(found.sources[name].folder, error))
     if refused:
         found.notes.append(f"{len(refused)} of {len(first)} animations are left out: {refused[0]}")
@@ -31,7 +31,7 @@ def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
 
 
 def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int = 4) -> bytes:
-    """The first agent steps of an evaluation episode of a run's policy, every so many a picture: an animated WebP.
+    """An animated WebP of the first agent steps of an evaluation episode, with a frame after `every` steps.
 
     `trust` are the modules that the run's files may name.
     """

@@ -1,4 +1,4 @@
-"""Rows of the representations that rewards have learned: the networks of a run folder on transitions of expert and agent."""
+"""Transitions of expert and agent in the representation that a run's reward has learned."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pcil import compilation, envs, modules, seeds
 from pcil.errors import InputError
 from pcil.files import flat
 from pcil.report.embedding import project
-from pcil.report.load import Collection, Dot, Point, Source, named, place
+from pcil.report.load import Collection, EvalRow, Source, TransitionRow, named, sort_key
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.training import learner, runs, state
@@ -23,13 +23,13 @@ from pcil.training.config import Run
 from pcil.types import Batch, Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
-"""As many transitions as the paper's Figure 4 has."""
+"""The numbers of transitions in the paper's Figure 4."""
 NUMBERS = 2**28
-"""At most so many numbers are restored of a run, as its settings ask for: 1 GiB."""
+"""The largest number of parameters of a run that are restored: 1 GiB."""
 
 
 def add(found: Collection, trust: Sequence[str] = ()) -> None:
-    """Rows of every run that has a representation into `found.dots`, and a note of those that should have and have not.
+    """Add rows to `found.transitions` for every run with a representation, and a note about runs whose networks can't be read.
 
     `trust` are the modules that the runs' files may name.
     """
@@ -40,20 +40,20 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         return
     refused: list[str] = []
     for name, source in found.sources.items():
-        last = [point for point in found.points if point[:4] == name][-1]
+        last = [row for row in found.rows if row[:4] == name][-1]
         try:
-            found.dots.extend(transitions(source, last, trust))
-        except Exception as error:  # whatever a damaged folder or somebody's environment raises
+            found.transitions.extend(transitions(source, last, trust))
+        except Exception as error:  # a damaged folder or a user's environment can raise anything
             refused.append(named(source.folder, error))
-    found.dots.sort(key=place)
+    found.transitions.sort(key=sort_key)
     if refused:
         found.notes.append(f"The representation of {len(refused)} of {len(found.sources)} runs is left out: {refused[0]}")
 
 
-def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[Dot]:
-    """Random steps of the demonstrations and of the training episode that would come next, by the newest checkpoint's networks.
+def transitions(source: Source, row: EvalRow, trust: Sequence[str] = ()) -> list[TransitionRow]:
+    """Embed random steps of the demonstrations and of the next training episode with the networks of the latest checkpoint.
 
-    Empty where the run's reward has no representation; `InputError` where it can't be restored.
+    Empty if the run's reward has no representation; `InputError` if the run can't be restored.
     """
     run = Run.from_json(source.settings)
     if type(run.reward).representation is Reward.representation:
@@ -74,25 +74,25 @@ def transitions(source: Source, row: Point, trust: Sequence[str] = ()) -> list[D
         frames = restored.counters.frames
         played = play(run, [env], envs.spec(env), restored, learn=False)
     embed = learner.frozen_embed(run.learner, restored.learner.agent)
-    seen = []
+    embeddings = []
     for episodes, rows in ((demos.episodes, EXPERT_STEPS), (played, AGENT_STEPS)):
         batch, reward = _steps(run, episodes, rows, rng)
         embedded = run.reward.representation(restored.learner.reward, batch, embed)
-        seen.append((np.asarray(embedded), reward))
-    (expert, _), (agent, reward) = seen
+        embeddings.append((np.asarray(embedded), reward))
+    (expert, _), (agent, reward) = embeddings
     return project(expert, agent, reward, row._replace(frames=frames))
 
 
 def with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Flat settings with those that they lack; as they are where no run has them."""
+    """Settings by dotted names, completed with the defaults of those that are missing; unchanged if they fit no run."""
     try:
         return flat(Run.from_json(settings).to_json())
-    except Exception:  # it checks settings of every kind, here of a file from anywhere
+    except Exception:  # the settings are from a file that may hold anything
         return settings
 
 
 def _steps(run: Run, episodes: Sequence[Episode], rows: int, rng: np.random.Generator) -> tuple[Batch, np.ndarray]:
-    """So many random steps, none twice, and the environment's reward of each."""
+    """Random distinct steps, and the environment's reward of each."""
     episodes = [state.absorbed(run, episode) for episode in episodes]
     columns = zip(*((*Batch.of(episode.obs, episode.action)[:3], episode.reward) for episode in episodes), strict=True)
     chosen = rng.permutation(sum(map(len, episodes)))[:rows]

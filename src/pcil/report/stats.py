@@ -1,7 +1,7 @@
-"""What a few seeds say: means and interquartile means with 95% intervals, probability of improvement, sample efficiency.
+"""Statistics of a few seeds: means and interquartile means with 95% intervals, probability of improvement, sample efficiency.
 
-`strata` are the scores of one method: an array for each task, whose first axis is the seed. A bootstrap draws seeds with
-replacement within each task and never mixes tasks (Agarwal et al. 2021).
+`strata` are the scores of one method: an array for each task, with the seeds along the first axis. The bootstrap is
+stratified: it draws seeds with replacement within each task (Agarwal et al. 2021).
 """
 
 from __future__ import annotations
@@ -13,40 +13,40 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from pcil.report.load import Point
+from pcil.report.load import EvalRow
 
 LEVEL = 0.95
 RESAMPLES = 2000
 
 
 class Interval(NamedTuple):
-    """A value and the ends of its 95% interval, which are NaN where a single seed says nothing of the spread."""
+    """A value and the bounds of its 95% interval, which are NaN if there is only one seed."""
 
     value: float
     low: float
     high: float
 
     def overlaps(self, other: Interval) -> bool | None:
-        """Whether the two share a point; None where one of them is unknown."""
+        """Whether the intervals overlap; None if a bound is unknown."""
         if any(map(math.isnan, (*self, *other))):
             return None
         return self.low <= other.high and other.low <= self.high
 
 
 def mean_interval(scores: Sequence[float] | np.ndarray) -> Interval:
-    """The mean over seeds and Student's interval, which holds for few seeds if their scores are normal."""
+    """The mean over seeds and Student's t interval, which is valid for few seeds if their scores are normally distributed."""
     deviation = float(np.std(scores, ddof=1)) if len(scores) > 1 else math.nan
     return student(float(np.mean(scores)), deviation, len(scores))
 
 
 def student(mean: float, deviation: float, seeds: int) -> Interval:
-    """Student's interval from a mean and a sample standard deviation over seeds, as papers print them."""
+    """Student's t interval from a mean and a sample standard deviation over seeds, as papers report them."""
     half = float(stats.t.ppf((1 + LEVEL) / 2, seeds - 1)) * deviation / math.sqrt(seeds) if seeds > 1 else math.nan
     return Interval(mean, mean - half, mean + half)
 
 
 def iqm(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Interquartile mean of all scores together: the mean without the lowest and highest quarter; of three, it is the mean."""
+    """Interquartile mean of the pooled scores: the mean without the lowest and the highest quarter. Of three it is the mean."""
     return np.asarray(stats.trim_mean(np.concatenate(strata, axis=axis), 0.25, axis=axis))
 
 
@@ -56,7 +56,7 @@ def iqm_interval(strata: Sequence[np.ndarray]) -> Interval:
 
 
 def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Interval:
-    """Chance that a run of ours beats one of theirs on the same task, a tie being half; the mean over tasks."""
+    """Probability that a run of ours beats a run of theirs on the same task, averaged over tasks; a tie counts one half."""
 
     def chance(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
         moved = [np.moveaxis(scores, axis, -1) for scores in strata]
@@ -69,9 +69,9 @@ def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.n
 
 
 def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the percentile interval of `statistic(*strata, axis=...)`; trailing axes of the strata go along.
+    """Bounds of the percentile interval of `statistic(*strata, axis=...)`, for each index of the trailing axes.
 
-    Every call draws the same. NaN where a task has one seed, for then nobody knows how much its score varies.
+    The draws are the same in every call. The bounds are NaN if a task has only one seed.
     """
     if min(map(len, strata)) < 2:
         nothing = np.full(strata[0].shape[1:], math.nan)
@@ -81,13 +81,13 @@ def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tu
     return np.asarray(low), np.asarray(high)
 
 
-def share_of_expert(runs: Sequence[Sequence[Point]], scores: np.ndarray) -> np.ndarray | None:
-    """Scores, one row a run, in units of the demonstrations' return; None where that is unknown or not positive."""
+def share_of_expert(runs: Sequence[Sequence[EvalRow]], scores: np.ndarray) -> np.ndarray | None:
+    """Scores, with one row for each run, divided by the demonstrations' return; None if that is unknown or not positive."""
     experts = np.array([run[-1].expert_return or 0 for run in runs])
     return None if experts.min() <= 0 else (scores.T / experts).T
 
 
-def first_reach(run: Sequence[Point], share: float) -> Point | None:
-    """The first evaluation at which a run has this share of its expert's return, if there is one."""
-    reached = (point for point in run if point.return_mean >= share * (point.expert_return or math.inf) > 0)
+def first_reach(run: Sequence[EvalRow], share: float) -> EvalRow | None:
+    """The first evaluation at which a run reaches this share of its expert's return; None if there is none."""
+    reached = (row for row in run if row.return_mean >= share * (row.expert_return or math.inf) > 0)
     return next(reached, None)

@@ -1,8 +1,7 @@
-"""Tables of a set of runs: CSV with every number, Markdown and HTML to be read. Each maker's docstring is its table's note."""
+"""Tables of a set of runs, as CSV, Markdown and HTML. The docstring of a maker is the title and the caption of its table."""
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import re
@@ -15,7 +14,7 @@ import numpy as np
 from pcil.errors import shown
 from pcil.report import stats
 from pcil.report.embedding import measures
-from pcil.report.load import OFFLINE, Collection, Point, curves, label, matrix, plain
+from pcil.report.load import OFFLINE, Collection, EvalRow, by_variant, label, matrix, write_csv
 from pcil.report.stats import Interval
 
 PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviation
@@ -27,12 +26,12 @@ PAPER = {  # paper Table 1: final return over 3 seeds, mean and standard deviati
 PAPER_TASKS = ("finger_spin", "walker_run", "hopper_stand", "hopper_hop")
 PAPER_SEEDS = 3
 SHARES = (0.5, 0.8, 0.9)
-"""Of the expert's return, to which the way is measured."""
+"""Shares of the expert's return for which sample efficiency is measured."""
 KEY = ("task", "method", "variant")
 
 
 class Table(NamedTuple):
-    """A header and rows of words, numbers, `Interval`s and None; empty where there is nothing to say."""
+    """A header and rows of text, numbers, `Interval`s and None; no rows if the table does not apply to the runs."""
 
     header: tuple[str, ...]
     rows: list[tuple[Any, ...]]
@@ -41,28 +40,28 @@ class Table(NamedTuple):
 def finals(found: Collection) -> Table:
     """Final return of each task: mean over seeds at the last evaluation that all of them have, with Student's 95% interval.
 
-    sd is the sample standard deviation. The interquartile mean (IQM) has a bootstrap interval; of three seeds the IQM is the
-    mean, and a bootstrap of three is too narrow.
+    sd is the sample standard deviation. The interquartile mean (IQM) has a bootstrap interval. Of three seeds the IQM is the
+    mean, and its bootstrap interval is too narrow.
     """
     rows = []
-    for name, runs in curves(found.points).items():
+    for name, runs in by_variant(found.rows).items():
         frames, final = _final(runs)
         share = stats.share_of_expert(runs, final)
-        spread = float(np.std(final, ddof=1)) if len(final) > 1 else None
+        deviation = float(np.std(final, ddof=1)) if len(final) > 1 else None
         expert = runs[0][-1].expert_return, None if share is None else float(share.mean())
-        ours = stats.mean_interval(final), spread, stats.iqm_interval([final])
+        ours = stats.mean_interval(final), deviation, stats.iqm_interval([final])
         rows.append((*name, *ours, *expert, len(final), frames))
     return Table((*KEY, "mean", "sd", "IQM", "expert", "of expert", "seeds", "frames"), rows)
 
 
 def overview(found: Collection) -> Table:
-    """Returns at a glance: the mean over seeds that the next tables explain, for each task, the demonstrations' beside it.
+    """Returns at a glance: mean final return over seeds for each task, with its 95% interval, and the demonstrations' return.
 
-    A blank was not run, and a method that has fewer frames of a task than another says how many. The longer of the two axes
-    goes down.
+    A blank cell was not run. Where a method has fewer frames on a task than another method, its cell states how many.
     """
+    # the longer of the two axes runs down the page
     means, experts, lengths = {}, {}, {}
-    for (task, *name), runs in curves(found.points).items():
+    for (task, *name), runs in by_variant(found.rows).items():
         frames, final = _final(runs)
         means[task, tuple(name)] = stats.mean_interval(final)
         lengths[task, tuple(name)] = 0 if name[0] in OFFLINE else frames
@@ -79,13 +78,13 @@ def overview(found: Collection) -> Table:
 
 
 def paper(found: Collection) -> Table:
-    """Beside the paper's numbers: its Table 1, mean and standard deviation over 3 seeds after 2,000,000 frames.
+    """Comparison with the paper: Table 1 of the paper has mean and standard deviation over 3 seeds after 2,000,000 frames.
 
-    Its interval is Student's from those, as ours is; if its deviation is a population's and not a sample's, which it does not
-    say, the interval is 1.22 times as wide. Mind the frames of ours.
+    Both intervals are Student's. The paper does not say whether its standard deviation is that of a sample, which is assumed
+    here, or of a population; in the latter case its interval is 1.22 times as wide. Our runs may have fewer frames.
     """
     rows = []
-    for (task, method, variant), runs in curves(found.points).items():
+    for (task, method, variant), runs in by_variant(found.rows).items():
         if task in PAPER_TASKS and method in PAPER:
             frames, final = _final(runs)
             published = stats.student(*PAPER[method][PAPER_TASKS.index(task)], PAPER_SEEDS)
@@ -97,13 +96,13 @@ def paper(found: Collection) -> Table:
 
 
 def aggregate(found: Collection) -> Table:
-    """All tasks together: final return as a share of the demonstrations', over all seeds of all tasks of a method.
+    """All tasks together: final return as a share of the demonstrations' return, over all seeds and tasks of a method.
 
-    The intervals are a bootstrap's that draws seeds within each task. Compare methods only where they have the same tasks and
-    the same frames.
+    The bootstrap intervals draw seeds within each task. Compare methods only if they have the same tasks and the same number
+    of frames.
     """
     rows = []
-    for name, tasks in _by_method(found.points).items():
+    for name, tasks in _by_method(found.rows).items():
         shares = (stats.share_of_expert(runs, _final(runs)[1]) for runs in tasks.values())
         if not (scores := [share for share in shares if share is not None]):
             continue
@@ -114,34 +113,34 @@ def aggregate(found: Collection) -> Table:
 
 
 def efficiency(found: Collection) -> Table:
-    """Sample efficiency: the first evaluation at which a seed has 50, 80 and 90% of the demonstrations' return.
+    """Sample efficiency: the first evaluation at which a seed reaches 50, 80 and 90% of the demonstrations' return.
 
-    How many seeds got there within the frames of the last column, and the median over all seeds, which is blank where half of
-    them did not. Minutes are wall-clock time since the run began: core-minutes where each run has one core to itself, and more
-    where it shared one. Methods that take no step in the environment are left out.
+    The table has the median over all seeds, which is blank if half of them never reach the share, and the number of seeds that
+    reach it within the frames of the last column. Minutes are wall-clock time since the start of the run; they equal
+    core-minutes only if the run had a core to itself. Methods that take no step in the environment are left out.
     """
     rows = []
-    for name, runs in curves(point for point in found.points if point.method not in OFFLINE).items():
-        row: list[Any] = [*name]
+    for name, runs in by_variant(row for row in found.rows if row.method not in OFFLINE).items():
+        cells: list[Any] = [*name]
         for reached in ([stats.first_reach(run, share) for run in runs] for share in SHARES):
-            frames = np.median([point.frames if point else math.inf for point in reached])
-            minutes = np.median([(point.seconds or math.nan) / 60 if point else math.inf for point in reached])
-            row += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
-            row.append(sum(point is not None for point in reached))
+            frames = np.median([row.frames if row else math.inf for row in reached])
+            minutes = np.median([(row.seconds or math.nan) / 60 if row else math.inf for row in reached])
+            cells += [int(frames) if np.isfinite(frames) else None, float(minutes) if np.isfinite(minutes) else None]
+            cells.append(sum(row is not None for row in reached))
         if stats.share_of_expert(runs, np.zeros(len(runs))) is not None:
-            rows.append((*row, len(runs), _final(runs)[0]))
-    words = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
-    return Table((*KEY, *words, "seeds", "frames"), rows)
+            rows.append((*cells, len(runs), _final(runs)[0]))
+    columns = (f"{word} {share:.0%}" for share in SHARES for word in ("frames to", "minutes to", "seeds to"))
+    return Table((*KEY, *columns, "seeds", "frames"), rows)
 
 
 def improvement(found: Collection) -> Table:
-    """Probability of improvement: the chance that a run of the first method ends above one of the second.
+    """Probability of improvement: the probability that a run of the first method has a higher return than one of the second.
 
-    On the same task and at the last evaluation that both have (of a method that takes no step in the environment, its last), a
-    tie being half; the mean over the tasks that both have, with a bootstrap interval.
+    Runs are compared on the same task, at the last evaluation that both methods have (a method that takes no step in the
+    environment, at its own last); a tie counts one half. The value is the mean over common tasks, with a bootstrap interval.
     """
     rows = []
-    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.points).items(), 2):
+    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.rows).items(), 2):
         both = (_at_the_same_frames(x[task], y[task]) for task in x if task in y)
         if pairs := [pair for pair in both if pair]:
             chance = stats.probability_of_improvement(*zip(*pairs, strict=True))
@@ -150,13 +149,13 @@ def improvement(found: Collection) -> Table:
 
 
 def health(found: Collection) -> Table:
-    """Health of the learned reward: its correlation with the true one over the steps of a training episode.
+    """Health of the learned reward: its correlation with the true reward over the steps of a training episode.
 
-    Mean over the episodes of each half of the run in which both vary, with Student's interval over seeds. The task's own reward
-    has 1.
+    Each value is the mean over the episodes of one half of the run in which both rewards vary, with Student's interval over
+    seeds. The task's own reward has correlation 1.
     """
     rows = []
-    for name, runs in curves(found.points).items():
+    for name, runs in by_variant(found.rows).items():
         frames, correlation = matrix(runs, "correlation")
         if len(frames) > 1:
             halves = np.array_split(correlation, 2, axis=1)
@@ -165,17 +164,17 @@ def health(found: Collection) -> Table:
 
 
 def representation(found: Collection) -> Table:
-    """Representation: how well distance to the experts tells the true reward, and whether the experts are one cluster.
+    """Representation: how well the distance to the experts predicts the true reward, and whether the experts form a cluster.
 
-    Both in the representation itself, not in its picture. Spearman's rank correlation of an agent transition's distance to
-    the experts' mean with its reward is -1 where distance tells all. The experts' mean silhouette is 1 where they lie together,
-    apart from the agent, and 0 or less where they are scattered among its transitions.
+    Both are computed in the representation, not in its t-SNE. Spearman's rank correlation between an agent transition's
+    distance to the experts' mean and its reward is -1 if the distance determines the order of the rewards. The experts' mean
+    silhouette is near 1 if they form a cluster apart from the agent, and 0 or less if they are scattered among its transitions.
     """
     rows = []
-    for name, seeds in curves(found.dots).items():
+    for name, seeds in by_variant(found.transitions).items():
         columns: list[Any] = []
         for values in zip(*map(measures, seeds), strict=True):
-            each = ", ".join(f"{dots[0].seed}: {value:.2f}" for dots, value in zip(seeds, values, strict=True))
+            each = ", ".join(f"{run[0].seed}: {value:.2f}" for run, value in zip(seeds, values, strict=True))
             columns += [stats.mean_interval(values), each]
         rows.append((*name, *columns))
     return Table((*KEY, "Spearman", "Spearman of each seed", "silhouette", "silhouette of each seed"), rows)
@@ -187,14 +186,14 @@ MAKERS: dict[str, Maker] = {
 }
 
 
-def words(make: Maker) -> tuple[str, str]:
-    """Title and note of a maker's table."""
-    title, _, note = " ".join((make.__doc__ or "").split()).partition(": ")
-    return title, note[:1].upper() + note[1:]
+def title_and_caption(make: Maker) -> tuple[str, str]:
+    """The title and the caption of a maker's table."""
+    title, _, caption = " ".join((make.__doc__ or "").split()).partition(": ")
+    return title, caption[:1].upper() + caption[1:]
 
 
 def cell(value: Any) -> str:
-    """A cell as people read it: one decimal from 10 on, two below."""
+    """A cell as text: numbers from 10 on with one decimal, smaller ones with two."""
     if isinstance(value, Interval):
         return cell(value.value) + ("" if math.isnan(value.low) else f" [{cell(value.low)}, {cell(value.high)}]")
     if isinstance(value, float):
@@ -203,7 +202,7 @@ def cell(value: Any) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table alone, with a line break at its end; no text in it is markup."""
+    """The table in Markdown, with a line break at its end; text is escaped, so that none of it is markup."""
 
     def escaped(value: Any) -> str:
         return re.sub(r"[\\`*<\[|&$~]", r"\\\g<0>", shown(value)) if isinstance(value, str) else cell(value)
@@ -213,29 +212,27 @@ def markdown(table: Table) -> str:
 
 
 def write(name: str, table: Table, folder: Path) -> None:
-    """`<name>.md` with title and note, and `<name>.csv`, where an interval has three columns."""
-    title, note = words(MAKERS[name])
-    (folder / f"{name}.md").write_text(f"# {title}\n\n{note}\n\n{markdown(table)}", encoding="utf-8")
-    wide = [isinstance(value, Interval) for value in table.rows[0]]
-    header = [(name, f"{name} low", f"{name} high") if w else (name,) for name, w in zip(table.header, wide, strict=True)]
-    with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(map(plain, itertools.chain(*header)))
-        for row in table.rows:
-            flat = itertools.chain(*(value if isinstance(value, Interval) else (value,) for value in row))
-            cells = (plain(value) if isinstance(value, str) else value for value in flat)
-            rows.writerow([round(value, 6) if isinstance(value, float) else value for value in cells])
+    """Write `<name>.md` with title and caption, and `<name>.csv`, in which an interval has three columns."""
+    title, caption = title_and_caption(MAKERS[name])
+    (folder / f"{name}.md").write_text(f"# {title}\n\n{caption}\n\n{markdown(table)}", encoding="utf-8")
+    first = zip(table.header, table.rows[0], strict=True)
+    header = [[word, f"{word} low", f"{word} high"] if isinstance(value, Interval) else [word] for word, value in first]
+    split = ([value if isinstance(value, Interval) else (value,) for value in row] for row in table.rows)
+    lines = ([round(value, 6) if isinstance(value, float) else value for value in itertools.chain(*row)] for row in split)
+    write_csv(folder / f"{name}.csv", [itertools.chain(*header), *lines])
 
 
-def _final(runs: Sequence[Sequence[Point]]) -> tuple[int, np.ndarray]:
-    """The last frames at which every seed was evaluated, and the returns `[seeds]` there."""
+def _final(runs: Sequence[Sequence[EvalRow]]) -> tuple[int, np.ndarray]:
+    """The number of frames of the last evaluation that every seed has, and the returns `[seeds]` there."""
     frames, returns = matrix(runs)
     return int(frames[-1]), returns[:, -1]
 
 
-def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The returns `[seeds]` of both at the last evaluation that all their runs have; the last of each where one is offline, and
-    None where they have no evaluation in common."""
+def _at_the_same_frames(x: list[list[EvalRow]], y: list[list[EvalRow]]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The returns `[seeds]` of two methods at the last evaluation that all their runs have; None if they have none in common.
+
+    If one of the methods takes no step in the environment, each has its own last evaluation.
+    """
     if {x[0][0].method, y[0][0].method} & set(OFFLINE):
         return _final(x)[1], _final(y)[1]
     if not len(matrix([*x, *y])[0]):
@@ -244,10 +241,10 @@ def _at_the_same_frames(x: list[list[Point]], y: list[list[Point]]) -> tuple[np.
     return last[: len(x)], last[len(x) :]
 
 
-def _by_method(points: Sequence[Point]) -> dict[Any, dict[str, list[list[Point]]]]:
-    """The seeds' rows by method and variant, then by task."""
-    found: dict[Any, dict[str, list[list[Point]]]] = {}
-    for (task, *name), runs in curves(points).items():
+def _by_method(rows: Sequence[EvalRow]) -> dict[Any, dict[str, list[list[EvalRow]]]]:
+    """The rows of the seeds, by method and variant and then by task."""
+    found: dict[Any, dict[str, list[list[EvalRow]]]] = {}
+    for (task, *name), runs in by_variant(rows).items():
         found.setdefault(tuple(name), {})[task] = runs
     return found
 

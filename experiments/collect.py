@@ -7,7 +7,8 @@ import json
 import sys
 from pathlib import Path
 
-from pcil.report.load import flat, read_rows, read_run, sort_key, write_rows
+from pcil.files import flat
+from pcil.report.load import read_rows, read_run, sort_key, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training import presets
 from pcil.training.config import renamed

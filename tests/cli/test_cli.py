@@ -350,7 +350,7 @@ def test_evaluate_prints_json_and_nothing_else(run: Path, capsys: pytest.Capture
     words = ["evaluate", str(run), "--episodes", "3", "--seed", "5"]
     assert cli.main([*words, "--json"]) == 0
     row = json.loads(capsys.readouterr().out)
-    assert list(row) == ["task", "episodes", "seed", "return_mean", "return_std", "returns"]
+    assert list(row) == ["task", "episodes", "seed", "return_mean", "return_std", "return_min", "returns"]
     assert (row["task"], row["episodes"], row["seed"]) == (POINT_MASS, 3, 5)
     assert len(row["returns"]) == 3 and len(set(row["returns"])) == 3
     assert np.isclose(row["return_mean"], np.mean(row["returns"])) and np.isclose(row["return_std"], np.std(row["returns"]))

@@ -10,7 +10,8 @@ import pytest
 
 from fake_runs import fake_run, fake_sweep
 from pcil.errors import InputError
-from pcil.report.load import EvalRow, TransitionRow, by_variant, collect, flat, label, matrix, read_rows, read_run, write_rows
+from pcil.files import flat
+from pcil.report.load import EvalRow, TransitionRow, by_variant, collect, label, matrix, read_rows, read_run, write_rows
 from pcil.report.variants import NO_VARIANT
 from pcil.training.config import MACHINE_SETTINGS
 

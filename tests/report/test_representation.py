@@ -17,8 +17,9 @@ import pytest
 from pcil import seeds
 from pcil.demos import Demonstrations
 from pcil.errors import InputError
+from pcil.files import flat
 from pcil.report import representation
-from pcil.report.load import Collection, collect, flat
+from pcil.report.load import Collection, collect
 from pcil.rewards import DAC, PCIL
 from pcil.training import learner, runs
 from pcil.training.config import Run

@@ -110,6 +110,29 @@ def test_a_policy_that_returns_too_few_actions_is_noticed() -> None:
         evaluate(lambda obs: policy(obs)[:-1], walks(2, 2), seed=0)
 
 
+class Reporting(Walk):
+    """Says at each step how far it is, whether that is success, and something in words."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, _ = super().step(action)
+        info = {"is_success": np.bool_(self.position > 0), "position": self.position, "note": "text", "pair": [1, 2]}
+        return obs, reward, terminated, truncated, info | ({} if self.left else {"only at the end": 1})
+
+
+def test_the_numbers_of_each_episodes_last_info_are_kept() -> None:
+    environments = [Reporting(length) for length in (3, 1, 5)]
+    result = evaluate(policy, environments, seed=3)
+    ends = [env.position for env in environments]
+    assert {name: column.tolist() for name, column in result.info.items()} == {
+        "is_success": [float(end > 0) for end in ends],
+        "position": ends,
+        "only at the end": [1, 1, 1],
+    }
+    assert result.success == [float(end > 0) for end in ends] and 0 < sum(result.success) < 3
+    assert evaluate(policy, [*environments, Walk(2)], seed=3).info == {}, "what one of them does not say is left out"
+    assert evaluate(policy, walks(2), seed=3).success is None
+
+
 def test_the_mean_is_over_episodes() -> None:
     assert Evaluation(np.array([1.0, 2.0, 6.0]), np.array([1, 1, 1]), 0.5).mean == 3.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import tempfile
 from collections.abc import Callable, Iterator
@@ -44,6 +45,7 @@ class Writer(Callbacks):
     """The log files and TensorBoard, as a run has them."""
 
     def __init__(self, folder: Path, logs: dict[str, str], said: list[str]) -> None:
+        folder.mkdir(exist_ok=True)
         self.files = LogFiles(folder, logs, Told(said))
         super().__init__([self.files, TensorBoard()])
         self.begin(small_run(), folder, self.files.history(0.0, None))
@@ -103,6 +105,25 @@ def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
         assert tag in content
     assert b"note" not in content and b"bad" not in content
     assert np.float32(7.5).tobytes() in content
+
+
+def test_success_is_the_last_column_where_the_environment_reports_it(tmp_path: Path) -> None:
+    """From the first evaluation on; the file of a run that goes on keeps its columns, and so does one without."""
+    ended = lambda *success: dataclasses.replace(make_evaluation(1.5, -2.0), info={"is_success": np.array(success)})  # noqa: E731
+    with writer(tmp_path / "one") as log:
+        log.evaluation(2000, 12.34, ended(1.0, 0.0))
+        logs = log.logs()
+    with writer(tmp_path / "one", logs) as log:
+        log.evaluation(4000, 56.78, ended(1.0, 1.0))
+        log.evaluation(6000, 60.0, make_evaluation(3.0, 4.0))
+    rows = ["2000,0,1.5,10,12.3,1", "2000,1,-2.0,11,12.3,0", "4000,0,1.5,10,56.8,1", "4000,1,-2.0,11,56.8,1"]
+    rows += ["6000,0,3.0,10,60.0,nan", "6000,1,4.0,11,60.0,nan"]
+    assert (tmp_path / "one" / "eval.csv").read_text().splitlines() == ["frames,episode,return,length,seconds,success", *rows]
+    assert [point[1:3] for point in points(tmp_path / "one") if point[0] == "evaluation/success"] == [(2000, 0.5), (4000, 1.0)]
+    with writer(tmp_path / "two") as log:
+        log.evaluation(0, 1.0, make_evaluation(1.0))
+        log.evaluation(2000, 2.0, ended(1.0, 0.0))
+    assert (tmp_path / "two" / "eval.csv").read_text().splitlines()[::2] == [",".join(EVAL_COLUMNS), "2000,0,1.5,10,2.0"]
 
 
 @law

@@ -46,11 +46,16 @@ def evaluate(
         policy.check_fits(made[0])
         result = roll_out(policy, made, seed=seed, episodes=episodes)
     row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}
-    row |= {"return_std": float(result.returns.std()), "returns": result.returns.tolist()}
+    row |= {"return_std": float(result.returns.std()), "return_min": float(result.returns.min())}
+    row |= {"returns": result.returns.tolist()}
+    if result.success:
+        row["success_rate"] = sum(result.success) / episodes
     if json_output:
         print(json.dumps(row))
     else:
         print(f"{shown(policy.task)}: return {result.mean:.1f} +- {row['return_std']:.1f} over {episodes} episodes")
+        if result.success:
+            print(f"  success in {sum(result.success):.0f} of {episodes}")
         print("  " + "  ".join(f"{value:.1f}" for value in result.returns))
     return 0
 

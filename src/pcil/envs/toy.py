@@ -77,7 +77,8 @@ class Reach(gymnasium.Env[np.ndarray, np.ndarray]):
         self._steps += 1
         distance = float(abs(self._state[0] - self._state[1]))
         reached = distance < self.REACHED
-        return self._state.astype(np.float32), -distance, reached, not reached and self._steps >= self.NUM_STEPS, {}
+        over = not reached and self._steps >= self.NUM_STEPS
+        return self._state.astype(np.float32), -distance, reached, over, {"is_success": reached}
 
     @classmethod
     def optimal_action(cls, obs: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The agent's seam: it turns windows of experience and a reward into a policy, and never asks where the reward came from."""
+"""The interface of agents. An agent learns a policy from windows of experience and a reward, wherever the reward comes from."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Explorer = Callable[[Any, np.ndarray, int], np.ndarray]
 
 @dataclass(frozen=True)
 class Agent(abc.ABC):
-    """Settings of an agent; all that changes is in the state, a pytree that goes in and comes out.
+    """Settings of an agent. Everything that changes is in its state, a pytree that methods take and return.
 
     `offline` is True for one that learns from the demonstrations alone, without a step in the environment.
     """
@@ -48,8 +48,8 @@ class Agent(abc.ABC):
     n_step: int = 3
     """Steps of reward before the target bootstraps: the length of a window."""
     absorbing: bool | None = None
-    """Whether a termination leads to an absorbing state, marked by a further entry in observations, so that an early end is
-    worth what the reward says of it; None: where the reward is learned and an episode may end early."""
+    """Whether a termination leads to an absorbing state, marked by an extra entry of observations, so that the reward decides
+    what an early end is worth. None: yes if the reward is learned and episodes can end early."""
 
     def __post_init__(self) -> None:
         check_kinds(self)
@@ -60,7 +60,7 @@ class Agent(abc.ABC):
         """The state before the first update."""
 
     def observe(self, state: Any, obs: Float[Array, "rows obs"]) -> Any:
-        """The state after its statistics of observations have taken in these rows, before anything is computed from them."""
+        """The state with its statistics of observations updated with these rows; called before anything is computed from them."""
         del obs
         return state
 
@@ -70,12 +70,12 @@ class Agent(abc.ABC):
 
     @abc.abstractmethod
     def actor(self, state: Any) -> Actor:
-        """The part of the state that acts; it is all that leaves the device between updates."""
+        """The part of the state that acts; nothing else leaves the device between updates."""
 
     @abc.abstractmethod
     def trunk(self, state: Any, whose: Literal["critic", "actor"]) -> Callable[[Any], Any]:
-        """The features of an observation on which imitation rewards are learned, a pytree; they are not trained by them."""
+        """The features of an observation that imitation rewards are learned on, as a pytree. Rewards do not train them."""
 
     @abc.abstractmethod
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
-        """What acts in one episode, with exploration noise from `rng`, on the host."""
+        """The exploring policy of one episode, with noise from `rng`; it acts on the host."""

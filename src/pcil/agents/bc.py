@@ -21,7 +21,7 @@ from pcil.types import Spec, Window
 
 
 class BCState(eqx.Module):
-    """The actor, its optimiser's opt_state, and the scale of observations."""
+    """The actor, the state of its optimiser, and the statistics of observations."""
 
     actor: Actor
     opt_state: OptState
@@ -35,9 +35,9 @@ class BC(Agent):
     offline: ClassVar[bool] = True
 
     n_step: int = 1
-    """Steps in a window; only the first is used."""
+    """Length of a window; only its first step is used."""
     learning_rate: float = 1e-4
-    """Adam's."""
+    """Adam's learning rate."""
     deviation: float = 0.1
     """Standard deviation of the Gaussian around the actor's mean action."""
     feature_dim: int = 50
@@ -45,7 +45,7 @@ class BC(Agent):
     hidden: int = 256
     """Width of the two hidden layers."""
     normalize_observations: bool = False
-    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunk: units make no difference then."""
+    """Normalize observations by their running mean and standard deviation, so that their units make no difference."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -26,10 +26,10 @@ from pcil.types import Spec, Window
 
 
 class DrQV2State(eqx.Module):
-    """Networks, the critic's slow copy (trunk included), the optimiser's opt_state, and the scale of observations."""
+    """The networks, the target critic (with its trunk), the states of the optimisers, and the statistics of observations."""
 
     actor: Actor
-    """Of scaled observations, as the critic; `DrQV2.actor` gives the one of plain observations."""
+    """It takes normalized observations, as the critic does; `DrQV2.actor` takes plain ones."""
     critic: Critic
     critic_target: Critic
     actor_opt_state: OptState
@@ -39,27 +39,27 @@ class DrQV2State(eqx.Module):
 
 @dataclass(frozen=True)
 class DrQV2(Agent):
-    """Settings of the agent."""
+    """Settings of DrQ-v2."""
 
     gamma: float = 0.99
-    """Discount for each agent step."""
+    """Discount per agent step."""
     learning_rate: float = 1e-4
-    """Adam's, for actor and critic."""
+    """Adam's learning rate, for actor and critic."""
     tau: float = 0.01
-    """Share of the critic that moves into its slow copy at each update."""
+    """Rate at which the target critic follows the critic, per update."""
     feature_dim: int = 50
     """Width of the trunk."""
     hidden: int = 256
     """Width of the two hidden layers of actor and critic."""
     noise: LinearSchedule = field(default_factory=LinearSchedule)
-    """Standard deviation of the exploration noise over agent steps."""
+    """Schedule of the standard deviation of the exploration noise, over agent steps."""
     noise_clip: float = 0.3
-    """Bound on the noise of the actions inside the updates; acting has no bound."""
+    """Bound of the noise on actions inside updates; the noise of acting is not clipped."""
     noise_correlation: float = 0.0
-    """Correlation of the acting noise of a step with that of the step before; 0 is white noise, as DrQ-v2's. Correlated
-    noise moves a joint for several steps in one direction."""
+    """Correlation of the exploration noise between consecutive steps; 0 is white noise, as in DrQ-v2. Correlated noise pushes
+    a joint in one direction for several steps."""
     normalize_observations: bool = False
-    """Scale observations to a running mean of 0 and standard deviation of 1 before the trunks: units make no difference."""
+    """Normalize observations by their running mean and standard deviation, so that their units make no difference."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Imitation rewards, one file each; `REWARDS` is the list that tests, the command line and the docs read."""
+"""Imitation rewards, one file each; `REWARDS` is the registry that tests, the command line and the docs read."""
 
 from pcil.rewards.adversarial import DAC
 from pcil.rewards.base import Embed, Inputs, Metrics, Reward, label, select
@@ -17,7 +17,7 @@ REWARDS: dict[str, type[Reward]] = {
     "tcn": TCN,
     "expert": TaskReward,
 }
-"""Every class of reward, by the name of the method that it is for; other methods are the same classes set otherwise."""
+"""The reward classes, by the name of their method; further methods are the same classes with other settings."""
 
 __all__ = [
     "DAC",

@@ -24,7 +24,7 @@ from pcil.types import Batch
 
 
 class DiscriminatorState(eqx.Module):
-    """The discriminator and its optimiser's opt_state."""
+    """The discriminator and the state of its optimiser."""
 
     discriminator: MLP
     opt_state: OptState
@@ -32,16 +32,16 @@ class DiscriminatorState(eqx.Module):
 
 @dataclass(frozen=True)
 class DAC(Reward):
-    """Settings of DAC's reward: `log D - log(1 - D)`, which is the logit itself, so it is never computed by logarithms."""
+    """Settings of DAC's reward, `log D - log(1 - D)`. It equals the discriminator's logit, so no logarithm is computed."""
 
     inputs: Inputs = "state"
-    """What is told apart: the states that steps led to, states with the actions taken in them, or both states of a step."""
+    """Input of the discriminator: the state a step led to, the state with the action taken in it, or both states of a step."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the logit."""
     hidden: int = 256
     """Width of the two hidden layers."""
     learning_rate: float = 1e-4
-    """Adam's."""
+    """Adam's learning rate."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

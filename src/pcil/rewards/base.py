@@ -1,4 +1,4 @@
-"""The reward's seam: a frozen dataclass of settings with pure methods; all that changes is its state, a pytree."""
+"""The interface of rewards: a frozen dataclass of settings with pure methods. Everything that changes is in its state, a pytree."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from pcil.types import Batch
 
 Metrics = dict[str, Float[Array, ""]]
 Inputs = Literal["state", "state-action", "transition"]
-"""What a reward is a function of: the state that a step led to, the state and the action taken there, or both states."""
+"""What a reward is a function of: the state a step led to, the state with the action taken in it, or both states."""
 Embed = Callable[[Float[Array, "*batch obs"]], Float[Array, "*batch features"]]
-"""The agent's features of an observation; no gradient flows through them. It is a pytree, so a state may keep it."""
+"""The agent's features of an observation, without gradient. It is a pytree, so a reward's state may hold it."""
 
 
 def select(inputs: Inputs, batch: Batch, embed: Embed) -> Float[Any, "*steps inputs"]:
-    """The features of the steps' `inputs`, actions as they are."""
+    """The features of the steps' `inputs`; actions are appended unchanged."""
     if inputs == "state":
         return embed(batch.next_obs)
     other = batch.action if inputs == "state-action" else embed(batch.next_obs)
@@ -32,7 +32,7 @@ def select(inputs: Inputs, batch: Batch, embed: Embed) -> Float[Any, "*steps inp
 
 
 class SlowFeatures(eqx.Module):
-    """A copy of the agent's features that stays as it is until so many updates have passed."""
+    """A copy of the agent's features that is renewed only every N updates."""
 
     embed: Embed
     updates: Int[Array, ""]
@@ -42,7 +42,7 @@ class SlowFeatures(eqx.Module):
         return cls(jax.tree.map(jnp.copy, embed), jnp.int32(0))
 
     def update(self, embed: Embed, every: int) -> SlowFeatures:
-        """One update later, with the agent's features of now if their turn has come."""
+        """The copy one update later, renewed if its turn has come."""
         updates = self.updates + 1
         newer = jax.tree.map(lambda old, new: jnp.where(updates % every == 0, new, old), self.embed, embed)
         return SlowFeatures(newer, updates)
@@ -50,7 +50,7 @@ class SlowFeatures(eqx.Module):
 
 @dataclass(frozen=True)
 class Reward(abc.ABC):
-    """An imitation reward: learned from demonstrations and from what the agent does.
+    """An imitation reward, learned from demonstrations and from the agent's experience.
 
     `scope` says what `reward` must be given: "step" for any steps in any order, "episode" for one whole episode in the order
     of time. `takes_padding` says of the latter that rows whose actions are NaN, which stand behind the episode's end, change
@@ -64,7 +64,7 @@ class Reward(abc.ABC):
     task_weight: float = 0.0
     """Weight of the environment's own reward, which is added to the learned one."""
     batch_size: int = 128
-    """Expert steps in one update, and as many of the agent."""
+    """Number of expert steps in an update, and of agent steps."""
 
     def __post_init__(self) -> None:
         check_kinds(self)
@@ -82,17 +82,17 @@ class Reward(abc.ABC):
 
     @property
     def trunk(self) -> Literal["critic", "actor"]:
-        """Whose trunk `embed` is."""
+        """Whether `embed` is the trunk of the critic or of the actor."""
         return "critic"
 
     @property
     def span(self) -> int:
-        """Least number of steps in the windows that `update` is given."""
+        """Minimum length of the windows that `update` is given."""
         return 1
 
     @property
     def prefill(self) -> tuple[int, float]:
-        """How many expert steps the replay begins with, and the reward stored for each of them."""
+        """The number of expert steps that the replay starts with, and the reward stored for each of them."""
         return 0, 0.0
 
     @abc.abstractmethod
@@ -119,12 +119,12 @@ class Reward(abc.ABC):
         return state
 
     def representation(self, state: Any, batch: Batch, embed: Embed) -> Float[Array, "T dim"] | None:
-        """Where the reward has put `T` steps, if it learns a representation."""
+        """The representation of `T` steps, if the reward learns one."""
         del state, batch, embed
         return None
 
     def total(self, learned: Float[Any, "*steps"], task_reward: Float[Any, "*steps"]) -> Float[Any, "*steps"]:
-        """What the agent is trained on: the learned reward plus the environment's, weighted."""
+        """The reward that the agent is trained on: the learned reward plus the weighted reward of the environment."""
         return learned + self.task_weight * task_reward if self.task_weight else learned  # 0 * NaN would be NaN
 
 

@@ -1,4 +1,4 @@
-"""What PCIL and TCN share: an encoder on the unit sphere, and the two heads that make a reward of it (paper Table 1)."""
+"""What PCIL and TCN share: an encoder on the unit sphere, and the two heads that turn it into a reward (paper Table 1)."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from pcil.rewards.base import Embed, Inputs, Metrics, select
 from pcil.types import Batch
 
 Head = Literal["similarity", "gail"]
-"""How a reward is made of an embedding: its cosine to an expert's, or the logit of a linear classifier."""
+"""The reward of an embedding: its cosine to an expert's embedding, or the logit of a linear classifier."""
 
 
 class Classifier(eqx.Module):
-    """A linear classifier of embeddings, expert or agent, and its optimiser's opt_state."""
+    """A linear classifier of embeddings (expert or agent), and the state of its optimiser."""
 
     linear: MLP
     opt_state: OptState
 
 
 class EmbeddingState(eqx.Module):
-    """The encoder, its optimiser's opt_state, the expert states that rewards compare with, and the head that learns, if any."""
+    """The encoder, the state of its optimiser, the expert steps that rewards compare with, and the learned head, if any."""
 
     encoder: MLP
     opt_state: OptState

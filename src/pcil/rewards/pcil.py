@@ -29,25 +29,25 @@ class PCIL(Reward):
     """Settings of PCIL's reward."""
 
     inputs: Inputs = "state"
-    """What is embedded: the states that steps led to, states with the actions taken in them, or both states of a step."""
+    """Input of the encoder: the state a step led to, the state with the action taken in it, or both states of a step."""
     temperature: float = 1.0
     """Divides the cosines inside the InfoNCE loss."""
     compare: Literal["random", "mean"] = "random"
-    """The reward's expert: a random sample or the mean embedding."""
+    """What the reward compares with: a random expert sample, or the mean expert embedding."""
     head: Head = "similarity"
     """The reward: similarity to the expert, or the logit of a linear classifier of embeddings ("gail")."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the similarity reward."""
     penalty_every: int = 1
-    """The penalty is computed at every so many updates, and then weighs as many times more."""
+    """Compute the penalty at every N-th update only, with N times the weight."""
     stages: int = 0
-    """Anchor on agent rows too, whose positives are from the same of so many stages of training; 0: on the expert alone."""
+    """Also take agent rows as anchors, with positives from the same one of N stages of training; 0: expert anchors only."""
     stage_weight: float = 1.0
     """Weight of the loss of the agent's anchors."""
     hidden: int = 256
     """Width of the three hidden layers; the embedding has a quarter of it."""
     learning_rate: float = 1e-4
-    """Adam's."""
+    """Adam's learning rate."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -86,9 +86,9 @@ class PWIL(Reward):
     beta: float = 5.0
     """How fast the reward falls: `sigma = beta horizon / sqrt(dimensions)`."""
     subsampling: int = 1
-    """One step in so many of each demonstration is used, from a random offset on."""
+    """Use every N-th step of each demonstration, starting at a random offset."""
     refresh: int = 5000
-    """Updates from one copy of the actor's trunk to the next; before the first the trunk is random."""
+    """Updates between two copies of the actor's trunk; the first copy is the untrained trunk."""
     prefill_steps: int = 0
     """Expert steps, each paid `alpha`, with which the replay begins."""
 

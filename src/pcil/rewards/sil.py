@@ -138,9 +138,9 @@ class SIL(SinkhornReward):
     embedding: int = 30
     """Dimensions of the space."""
     learning_rate: float = 5e-4
-    """Adam's."""
+    """Adam's learning rate."""
     every: int = 10
-    """Updates for each step of the critic."""
+    """Updates per step of the critic."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -194,7 +194,7 @@ class POTIL(SinkhornReward):
     batch_size: int = 0
     """Nothing is learned, so no steps are drawn."""
     refresh: int = 5000
-    """Updates from one copy of the actor's trunk to the next; before the first the trunk is random."""
+    """Updates between two copies of the actor's trunk; the first copy is the untrained trunk."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

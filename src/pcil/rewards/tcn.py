@@ -30,11 +30,11 @@ class TCN(Reward):
     temperature: float = 0.07
     """Divides the cosines inside the InfoNCE loss."""
     window: int = 1
-    """Most steps from an anchor to its positive."""
+    """Maximum number of steps between an anchor and its positive."""
     negatives: Literal["batch", "rollout"] = "batch"
     """An anchor's negatives: the positives of all other anchors, or states of the same rollout that are far in time."""
     margin: int = 10
-    """Least steps from an anchor to negatives of the same rollout; they reach to twice as many."""
+    """Minimum number of steps between an anchor and negatives of the same rollout; the maximum is twice that."""
     compare: Literal["random", "mean"] = "random"
     """The similarity reward's expert: a random sample or the mean embedding."""
     head: Head = "similarity"
@@ -42,7 +42,7 @@ class TCN(Reward):
     hidden: int = 256
     """Width of the three hidden layers; the embedding has a quarter of it."""
     learning_rate: float = 1e-4
-    """Adam's."""
+    """Adam's learning rate."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Who is told how a run goes: the run's own log files, TensorBoard, a progress bar, and a person's own logger."""
+"""Callbacks that are told how a run goes: its log files, TensorBoard, and loggers of a user's own."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EVAL_COLUMNS = ("frames", "episode", "return", "length", "seconds")
 
 
 class History(NamedTuple):
-    """What a run had logged when it was saved last; a new run has logged nothing."""
+    """What a run had logged before this session; empty for a new run."""
 
     episodes: list[dict[str, Any]]
     """The rows of `train.jsonl`."""
@@ -36,35 +36,35 @@ class History(NamedTuple):
 
 
 class Callback:
-    """Is told how a run goes, and does nothing unless a method is overridden.
+    """A callback is told how a run goes. Every method does nothing by default.
 
-    A logger of one's own is a subclass of it: `pcil.train(..., callbacks=[MyLogger()])`, or on the command line
-    `--callbacks my.module:MyLogger`, which is called without arguments. A metrics row is a dict of numbers by name, that of a
-    line of `train.jsonl`, with `frames` first.
+    To add a logger, subclass it and pass an instance: `pcil.train(..., callbacks=[MyLogger()])`, or on the command line
+    `--callbacks my.module:MyLogger`, which is created without arguments. A metrics row is a dict of numbers by name, as in a
+    line of `train.jsonl`.
     """
 
     def begin(self, run: Run, folder: Path, history: History) -> None:
-        """The run begins in its folder, or goes on after what it had logged."""
+        """The run starts in its folder, or resumes after `history`."""
 
     def episode(self, row: dict[str, Any]) -> None:
-        """An episode was played, or a pass of an offline agent was made: its metrics row."""
+        """An episode has ended, or a pass of an offline agent: its metrics row."""
 
     def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
-        """The policy was evaluated after so many frames and seconds."""
+        """The policy was evaluated after `frames` frames and `seconds` of training."""
 
     def message(self, text: str) -> None:
-        """A sentence for a person."""
+        """A message for the user."""
 
     def stop(self) -> bool:
-        """Whether the run is to end here, saved; asked between episodes."""
+        """Whether to stop the run here and save it; asked between episodes."""
         return False
 
     def end(self) -> None:
-        """The run ends or stops: close what `begin` opened."""
+        """The run has ended or stopped: close what `begin` opened."""
 
 
 class Callbacks(Callback):
-    """Several callbacks as one, told in their order. What a person's own raises is a `RunError` that names it."""
+    """Several callbacks as one, called in order. An exception of a user's callback becomes a `RunError` that names it."""
 
     def __init__(self, callbacks: Sequence[Callback]) -> None:
         self._callbacks = list(callbacks)
@@ -104,30 +104,30 @@ def _call(callback: Callback, name: str, *arguments: Any) -> Any:
 
 
 class LogFiles(Callback):
-    """`eval.csv` and `train.jsonl`; a row is with the system when the call returns.
+    """Writes `eval.csv` and `train.jsonl`; a row is handed to the operating system before the call returns.
 
-    It is a part of the run: a checkpoint holds what the files hold, and a run that goes on makes them hold just that. One that
-    begins otherwise is written again, and a person is told.
+    Checkpoints hold the contents of both files, and a resumed run cuts the files back to them. A file that does not start with
+    these contents is written again, with a message to the user.
     """
 
     def __init__(self, folder: Path, saved: dict[str, str], tell: Callback) -> None:
-        """`saved` is what each file held at the checkpoint."""
+        """`saved` has the contents of each file at the checkpoint."""
         self._written = {name: [saved[name]] if name in saved else [] for name in LOGS}
         self._files = {name: _rewound(folder / name, saved.get(name), tell) for name in LOGS}
         if not self._written["eval.csv"]:
             self._write("eval.csv", ",".join(EVAL_COLUMNS) + "\n")
 
     def rows(self) -> dict[str, int]:
-        """How many texts were written to each file, for `contents`."""
+        """The number of texts written to each file, for `contents`."""
         return {name: len(texts) for name, texts in self._written.items()}
 
     def contents(self, rows: dict[str, int] | None = None) -> dict[str, str]:
-        """What each file holds, or held after so many texts, for a checkpoint."""
+        """The contents of each file, or its contents after `rows` texts, for a checkpoint."""
         rows = rows or self.rows()
         return {name: "".join(texts[: rows[name]]) for name, texts in self._written.items()}
 
     def history(self, seconds: float, demos_return: float | None) -> History:
-        """What other callbacks are to know of it."""
+        """The contents as other callbacks get them."""
         held = self.contents()
         rows = [json.loads(line) for line in held["train.jsonl"].splitlines()]
         return History(rows, list(csv.DictReader(io.StringIO(held["eval.csv"]))), seconds, demos_return)
@@ -160,9 +160,9 @@ class LogFiles(Callback):
 
 
 class TensorBoard(Callback):
-    """TensorBoard's file of a run, made again from the logs when the run goes on.
+    """Writes TensorBoard's file of a run; a resumed run rebuilds it from the logs.
 
-    It is written in this thread, so that a full disk is an error here and not one of another thread.
+    It is written in this thread, so that a full disk raises here and not in another thread.
     """
 
     def begin(self, run: Run, folder: Path, history: History) -> None:

@@ -1,4 +1,4 @@
-"""One pass of the loop: episodes that are played while the agent learns, or updates on demonstrations alone."""
+"""One pass of the loop: episodes played while the agent learns, or, offline, updates on demonstrations."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ OFFLINE_STEPS = 500
 
 
 class Labelled(NamedTuple):
-    """An episode that has ended: as the replay keeps it, with the learned reward of each of its steps."""
+    """A finished episode as the replay stores it, with the learned reward of each step."""
 
     episode: Episode
     reward: np.ndarray
     row: dict[str, Any]
-    """What there is to log of it."""
+    """Its metrics."""
 
 
 def play(run: Run, environments: Sequence[envs.Checked], spec: Spec, state: State, *, learn: bool = True) -> list[Episode]:
-    """One exploring episode in each environment, side by side: act, update, step. Without `learn` nothing is updated.
+    """Play one episode with exploration in each environment, side by side: act, update, step. Without `learn`, no update is made.
 
     An update is dispatched between acting and stepping, so that the device works while the environments step.
     """
@@ -75,7 +75,7 @@ def study(run: Run, spec: Spec, state: State) -> list[Episode]:
 
 
 def labelled(run: Run, state: State, episode: Episode, number: int) -> Labelled:
-    """An episode that has ended, labelled by the reward as it is now; `number` counts episodes from 1."""
+    """Label a finished episode with the current reward; `number` counts episodes from 1."""
     kept = absorbed(run, episode)
     state.learner = learner.close_episode(run.learner, state.learner, kept, number)
     reward = learner.label_episode(run.learner, state.learner, kept, number)
@@ -110,7 +110,7 @@ def _window_steps(run: Run) -> int:
 
 
 def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.random.Generator) -> Counters:
-    """Dispatch one update on draws from the replay and the demonstrations; returns the counters after it."""
+    """Dispatch one update on samples of the replay and the demonstrations, and return the counters after it."""
     rows, span = run.reward.batch_size, run.reward.span
     window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
     expert = state.expert.sample(rng, rows, span) if state.expert and rows else None

@@ -1,4 +1,4 @@
-"""What a run is: a tree of frozen dataclasses, one doc line a field. The command line is made from it."""
+"""The settings of a run, a tree of frozen dataclasses; the command line is generated from them and their documentation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pcil.files import flat
 from pcil.rewards import PCIL, REWARDS, Reward
 
 MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
-"""Settings that change no result, so a run may resume with others."""
+"""Settings that change no result; a run can be resumed with other values."""
 REGISTRIES: dict[str, dict[str, Any]] = {"agent": AGENTS, "reward": REWARDS}
 EnvKwargs = Annotated[
     dict[str, Any],
@@ -30,12 +30,12 @@ EnvKwargs = Annotated[
         str_from_instance=lambda value: [json.dumps(value)],
     ),
 ]
-"""Keyword arguments of an environment; one word of JSON on the command line."""
+"""Keyword arguments of an environment; on the command line, one argument in JSON."""
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """What learns: all that is static in the compiled step, so runs that differ in seed or frames share one compilation."""
+    """Everything that is static in the compiled step, so that runs that differ in seed or length share a compilation."""
 
     agent: Agent
     reward: Reward
@@ -55,20 +55,20 @@ class Run:
     env_kwargs: EnvKwargs = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment as a JSON object, such as '{"frame_skip": 5}'; they are given to gymnasium.make."""
     seed: int = 1
-    """Everything random follows from it."""
+    """The seed of everything random."""
     frames: int = 500_000
-    """Length of the run."""
+    """Length of the run, in frames."""
     demos: str | None = None
     """A shipped task, the folder of a Minari dataset or the id of a local one; by default what ships for the task."""
     num_demos: int | None = None
-    """Use only the first so many demonstrations."""
+    """Use only the first N demonstrations; by default all of them."""
     demos_mismatch: Literal["refuse", "scale", "keep"] = "refuse"
     """Demonstrations of an environment with another action box, other arguments or another time step: refuse them, or use them
     with actions scaled from the dataset's box to the environment's, or with the values of the actions kept as recorded."""
     clip_actions: bool = False
     """Clip demonstrated actions that are out of bounds, instead of refusing them."""
     label: Literal["sampled", "stored"] = "sampled"
-    """When a step gets its learned reward: each time it is sampled (never stale), or once, when its episode is stored."""
+    """When a step gets its learned reward: every time it is sampled (never stale), or once, when its episode is stored."""
     agent: Agent = field(default_factory=DrQV2)
     """The agent."""
     reward: Reward = field(default_factory=PCIL)
@@ -78,19 +78,19 @@ class Run:
     random_frames: int = 2000
     """Frames of uniformly random actions at the start."""
     update_every: int = 2
-    """Agent steps for each update."""
+    """Agent steps per update."""
     replay_steps: int = 500_000
     """Rows of the replay: a row for each agent step, and one more for each episode."""
     evaluate_every: int = 20_000
-    """Frames from one evaluation to the next."""
+    """Frames between two evaluations."""
     evaluate_episodes: int = 10
-    """Episodes of an evaluation."""
+    """Episodes per evaluation."""
     checkpoint_seconds: float = 120.0
-    """Least time from one checkpoint to the next; a checkpoint is written between episodes, and when the run stops."""
+    """Minimum time between two checkpoints, in seconds; checkpoints are written between episodes and when the run stops."""
     num_envs: int = 1
-    """Environments that are played side by side while training, an episode in each."""
+    """Number of environments that are stepped side by side during training."""
     single_environment: bool = False
-    """Open one environment at a time and evaluate in it too, one episode after the other: slower, with the same results."""
+    """Use one environment for training and evaluation, one episode after the other: slower, with the same results."""
 
     def __post_init__(self) -> None:
         check_kinds(self)
@@ -130,33 +130,33 @@ class Run:
 
     @property
     def learner(self) -> Algorithm:
-        """The part of the settings that is compiled."""
+        """The settings that are compiled."""
         return Algorithm(self.agent, self.reward, self.label)
 
     @property
     def own_modules(self) -> tuple[str, ...]:
-        """The modules of an agent and a reward that are none of ours."""
+        """The modules of the agent and the reward where these are not part of this package."""
         kinds = type(self.agent), type(self.reward)
         return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not kind.__module__.startswith("pcil.")))
 
     @property
     def needs_demos(self) -> bool:
-        """Whether demonstrations are used at all."""
+        """Whether the run uses demonstrations at all."""
         return self.reward.needs_demos or self.agent.offline
 
     @property
     def needs_actions(self) -> bool:
-        """Whether the actions of the demonstrations are read."""
+        """Whether the run reads the actions of the demonstrations."""
         return self.agent.offline or self.reward.needs_actions
 
     @property
     def needs_rewards(self) -> bool:
-        """Whether the rewards of the demonstrations are read: where the agent learns from demonstrated steps and the task's
-        reward counts."""
+        """Whether the run reads the rewards of the demonstrations: if the agent learns from demonstrated steps and the
+        environment's reward has a weight."""
         return self.reward.task_weight != 0 and (self.agent.offline or self.reward.prefill[0] > 0)
 
     def to_json(self) -> dict[str, Any]:
-        """Every setting, nested, as JSON gives it back; agent and reward say their class, ours by its name in the registry."""
+        """All settings as nested tables; classes have their name in the registry if they are ours, else their path."""
         tree = dataclasses.asdict(self)
         for name in REGISTRIES:
             kind = type(getattr(self, name))
@@ -165,17 +165,19 @@ class Run:
 
     @classmethod
     def from_json(cls, settings: dict[str, Any], classes: Mapping[str, type] | None = None) -> Run:
-        """The run that `to_json` gave, of an older version too; `settings` may be nested or `pcil.files:flat`.
+        """The run whose `to_json` gave these settings, in this version or an older one, nested or `pcil.files:flat`.
 
-        A setting that an older file lacks is its class's default, so a new setting's default must be what the code did without
-        it. Only our own agents and rewards are made, and those of `classes`, by their paths; `InputError` names another one.
+        A missing setting has the default of its class, so the default of a new setting must be what the code did before it.
+        Only agents and rewards of this package are created, and those in `classes`, by path; others raise `InputError`.
         """
         values = renamed(flat(settings))
         kinds: dict[str, Any] = {}
         for part, known in REGISTRIES.items():
             name = values.pop(f"{part}.class")
             if name not in {**known, **(classes or {})}:
-                raise InputError(f"The {part} {brief(name)} is none of ours, and what a file names is not run unasked.")
+                raise InputError(
+                    f"The {part} {brief(name)} is not part of this package, and code that a file names is not run without --trust."
+                )
             kinds[part] = {**known, **(classes or {})}[name]
         own = {field.name for field in dataclasses.fields(cls)}
         plain = {name: values.pop(name) for name in list(values) if name in own}
@@ -186,17 +188,17 @@ class Run:
 
 
 def _made(kind: type, first: dict[str, Any], part: str, values: dict[str, Any]) -> Any:
-    """A part of a run at its class's defaults, with what it can't be made without from the values."""
+    """An agent or a reward with the defaults of its class; fields without a default are taken from the values."""
     needed = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory is dataclasses.MISSING]
     return kind(**first, **{name: values[f"{part}.{name}"] for name in needed if f"{part}.{name}" in values})
 
 
 RENAMED = {"agent.standardise": "agent.normalize_observations"}
-"""Settings by the names that they had in older versions."""
+"""Names of settings in older versions, and their names today."""
 
 
 def renamed(settings: dict[str, Any]) -> dict[str, Any]:
-    """Flat settings of an older version, by the names that settings and classes have today."""
+    """Flat settings with the names that settings and classes have today."""
     values = {}
     for name, value in settings.items():
         part, _, rest = name.partition(".")
@@ -205,15 +207,15 @@ def renamed(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def registered(part: str, path: str) -> str:
-    """The registry's name of one of our own agents or rewards, by the path of its class in this version or an older one; other
-    names stay as they are."""
+    """The name in the registry for the path of one of our classes, in this version or an older one; other names are
+    returned unchanged."""
     own = {kind.__qualname__: name for name, kind in REGISTRIES[part].items()}
     module, _, name = path.partition(":")
     return own.get(name, path) if module.startswith("pcil.") else path
 
 
 def part_of_run(part: str, spec: str) -> Any:
-    """The class of agents or rewards that a name of the registry or `my.module:MyClass` stands for; the module is imported."""
+    """The class with a name in the registry, or the class `my.module:MyClass`, whose module is imported."""
     if spec in REGISTRIES[part]:
         return REGISTRIES[part][spec]
     base = {"agent": Agent, "reward": Reward}[part]
@@ -221,9 +223,9 @@ def part_of_run(part: str, spec: str) -> Any:
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:
-    """Settings with some fields changed; a dotted name such as "agent.noise.steps" reaches into nested ones.
+    """Settings with some fields changed; a dotted name such as "agent.noise.steps" is a field of nested settings.
 
-    Raises `InputError` for a name that is no field, with the fields that there are.
+    Raises `InputError`, which lists the fields, for a name that is not a field.
     """
     names = [field.name for field in dataclasses.fields(settings)]
     own: dict[str, Any] = {}
@@ -241,7 +243,7 @@ def changed(settings: Any, changes: dict[str, Any]) -> Any:
 
 
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
-    """What differs between two runs' settings, such as "agent.gamma was 0.99, now 0.9"; machine settings don't count."""
+    """The differences between the settings of two runs, such as "agent.gamma was 0.99, now 0.9", without machine settings."""
     found = []
     for name in dict.fromkeys([*old, *new]):
         before, after = old.get(name), new.get(name)

@@ -19,21 +19,21 @@ from pcil.policy import Policy, load_policy
 from pcil.seeds import Stream, episode_seed
 
 LOCKSTEP = 32
-"""Episodes that are played at once, at most."""
+"""Maximum number of episodes that are played at once."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `episodes` rollouts of the mean action gave."""
+    """The results of an evaluation: rollouts of the mean action."""
 
     returns: np.ndarray
-    """Sum of the environment's rewards, one number an episode, float64."""
+    """Undiscounted return of each episode, float64."""
     lengths: np.ndarray
-    """Agent steps, one number an episode."""
+    """Number of agent steps of each episode."""
     seconds: float
-    """Wall-clock time of all of them."""
+    """Wall-clock time of the evaluation."""
     info: dict[str, np.ndarray] = field(default_factory=dict)
-    """Each number that the environment's `info` held at the end of every episode, one an episode, by name."""
+    """The numbers in the environment's last `info` of each episode, by name; only those that every episode reports."""
 
     @property
     def mean(self) -> float:
@@ -119,7 +119,7 @@ def evaluate(
 
 
 def _reduced(infos: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The numbers that all of these have, by name."""
+    """The numbers that all of these have in common, by name."""
     names = [name for name in infos[0] if isinstance(name, str)]
     columns = {name: [np.asarray(info.get(name)) for info in infos] for name in names}
     fine = {name: all(x.size == 1 and x.dtype.kind in "fiub" for x in column) for name, column in columns.items()}

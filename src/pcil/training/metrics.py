@@ -1,4 +1,4 @@
-"""What is measured of an episode, and how the learned reward fits the environment's."""
+"""Metrics of an episode, and how well the learned reward agrees with the environment's."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pcil.types import Episode
 
 
 def described(episode: Episode, learned: np.ndarray) -> dict[str, Any]:
-    """What an episode brought, what the learned reward made of it, and how the two correlate: the method's health."""
+    """Return and length of an episode, its learned return, and the correlation of the two rewards over its steps."""
     return {
         "return": episode.total_reward,
         "length": len(episode),
@@ -21,7 +21,7 @@ def described(episode: Episode, learned: np.ndarray) -> dict[str, Any]:
 
 
 def pearson(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Pearson correlation; None where one of the two does not vary."""
+    """Pearson correlation; None if one of the two is constant."""
     if np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
     with np.errstate(invalid="ignore"):  # of values so small that their squares are 0

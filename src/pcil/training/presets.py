@@ -199,15 +199,15 @@ METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str
     ("expert", "released"): expert_as_released,
     ("expert", "default"): {"reward": "expert"},
 }
-"""What a method sets on top of a preset, some by the task; a dotted name changes one setting of the agent or of the reward."""
+"""What a method changes of a preset, for some methods by task; dotted names are settings of the agent or the reward."""
 METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 
 
 def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: Any) -> Run:
     """The run of a method with a preset, and any of its settings changed: `seed=2`, `**{"agent.gamma": 0.98}`.
 
-    Another `agent` or `reward` is an instance of it, a name of the registry, or `my.module:MyAgent`. Of an agent that is named,
-    those settings of the preset count that it has; a reward has its own. Unknown names raise `InputError`.
+    `agent` and `reward` may be an instance, a name in the registry, or `my.module:MyAgent`. A named agent takes those settings of
+    the preset that it has; another reward than the method's has the defaults of its class. Unknown names raise `InputError`.
     """
     _known("method", method, METHODS)
     _known("preset", preset, PRESETS)
@@ -221,7 +221,7 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
 
 
 def _counts(name: str, made: dict[str, Any], settings: dict[str, Any], parts: dict[str, Any]) -> bool:
-    """Whether a setting of preset and method counts: not the names of the parts, and not what is said of another part."""
+    """Whether a setting of the preset or the method applies to these parts."""
     part, _, rest = name.partition(".")
     if not rest:
         return name not in parts

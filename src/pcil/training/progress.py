@@ -1,4 +1,4 @@
-"""What a person sees of a run: a `rich` progress bar, and how to stop it well."""
+"""The progress bar of a run, and signals that stop it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run folders: who may write there, what `run.json` says, when a run is done; and `train`, which starts or resumes one."""
+"""Run folders: `run.json`, locks, `DONE`; and `train`, which starts or resumes a run."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Result:
     final_return: float
     """Mean return of the last evaluation."""
     demos_return: float | None
-    """Mean return of the demonstrations, where there were any with rewards."""
+    """Mean return of the demonstrations; None without demonstrations or without their rewards."""
     own_modules: tuple[str, ...] = ()
-    """Where an agent and a reward of a person's own are from."""
+    """The modules of an agent and a reward that are not part of this package."""
 
     @property
     def policy(self) -> Policy:
-        """What was learned."""
+        """The trained policy."""
         return load_policy(self.folder, self.own_modules)
 
 
@@ -57,7 +57,7 @@ def train(
     callbacks: Sequence[Callback] = (),
     **changes: Any,
 ) -> Result:
-    """Train a policy in the folder `out`, or resume or report what is there.
+    """Train a policy in the folder `out`, or resume the run that is there.
 
     `task` is a task's name, a function that makes a new environment at each call, or an environment, which is then the run's
     single one and is not closed. `demos` are `Demonstrations`, or the name or path of some. `callbacks` are told how the run
@@ -92,7 +92,7 @@ def train(
 
 
 class _StopOn(Callback):
-    """Asks to stop where a signal did."""
+    """Stops the run after a signal."""
 
     def __init__(self, signals: progress.Signals) -> None:
         self._signals = signals
@@ -213,7 +213,7 @@ def with_absorbing_decided(run: Run, demos: Demonstrations | None, ends_early: b
 
 @contextlib.contextmanager
 def _claimed(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, for this process alone."""
+    """The folder, created if necessary, locked for this process."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         strangers = sorted(path.name for path in folder.iterdir() if path.name != ".lock" and path.suffix != ".tmp")

@@ -1,4 +1,4 @@
-"""The state of a run: how it starts, is saved between two episodes, and is taken up again."""
+"""The state of a run: how it starts, and how it is saved and resumed between episodes."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ WALL_CLOCK = ("seconds", "frames_per_second")
 
 
 class Clock:
-    """Wall-clock seconds, going on from where an earlier session stopped."""
+    """Wall-clock time of a run over all its sessions."""
 
     def __init__(self, before: float) -> None:
         self._before, self._begin = before, time.perf_counter()
         self._last: tuple[int, float] | None = None
 
     def total(self) -> float:
-        """Seconds over all sessions."""
+        """Seconds until now, over all sessions."""
         return self._before + time.perf_counter() - self._begin
 
     def times(self, frames: int) -> dict[str, float]:
@@ -53,7 +53,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Counters:
-    """Where a run is; with the arrays, all that a checkpoint holds."""
+    """The counters of a run. A checkpoint holds these, the arrays and the logs."""
 
     frames: int = 0
     steps: int = 0
@@ -64,7 +64,7 @@ class Counters:
     seconds: float = 0.0
     """Wall-clock time until now, over all sessions."""
     final_return: float | None = None
-    """Mean return of the last evaluation, once there is nothing left to do."""
+    """Mean return of the last evaluation, once the run is finished."""
 
 
 @dataclass
@@ -73,7 +73,7 @@ class State:
 
     learner: Learner
     actor: Actor
-    """The actor as it left the last update."""
+    """The actor after the last update."""
     replay: Replay
     expert: Replay | None
     """The demonstrations; a checkpoint does not hold them."""
@@ -103,8 +103,8 @@ def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
 
 
 def absorbed(run: Run, episode: Episode) -> Episode:
-    """The episode as the run learns from it: where there is an absorbing state, an early end has as many steps there as it had
-    before, so that half of what a reward sees of it is its end, whatever its length."""
+    """The episode as the run learns from it. With an absorbing state, an episode that terminated gets as many absorbing steps as
+    it has steps, so that half of what a reward sees of it is its end, whatever its length."""
     return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
 
 
@@ -152,7 +152,7 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
 
 
 def save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: float) -> None:
-    """Leave the policy of this moment in the run's folder, with where it comes from."""
+    """Write the current policy to the run's folder, with its provenance."""
     info = {
         "method": run.method,
         "preset": run.preset,
@@ -176,9 +176,9 @@ def take_means(state: State) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def saved_on_failure(run: Run, folder: Path, state: State, log: LogFiles, clock: Clock) -> Iterator[Callable[[], None]]:
-    """Where the environment fails or training diverges, a checkpoint of the state as it is now is left, and no later one.
+    """Save a checkpoint of the state at this point if the environment fails or training diverges inside the context.
 
-    What it gives raises `RunError` where an update since has left the finite range.
+    The context's value is a function that raises `RunError` if an update since then has become NaN or infinite.
     """
     before, rows = replace(state, learner=learner.copied(state.learner)), log.rows()
 
@@ -201,7 +201,7 @@ def saved_on_failure(run: Run, folder: Path, state: State, log: LogFiles, clock:
 
 @contextlib.contextmanager
 def saved_anyway(folder: Path, state: State, log: LogFiles, clock: Clock) -> Iterator[None]:
-    """Where a callback fails, a checkpoint of the state as it is then is left."""
+    """Save a checkpoint of the state if a callback fails inside the context."""
     try:
         yield
     except RunError:
@@ -210,7 +210,7 @@ def saved_anyway(folder: Path, state: State, log: LogFiles, clock: Clock) -> Ite
 
 
 def _beginning(log: Path, length: int, say: Callable[[str], None]) -> str:
-    """So many bytes of a log, whose checkpoint, of an older version, does not hold them."""
+    """The first bytes of a log, for a checkpoint of an older version, which does not hold the log itself."""
     content = log.read_bytes()[:length] if log.exists() else b""
     if len(content) < length:
         say(f"{log} has lost {length - len(content):,} of the {length:,} bytes that it had at the checkpoint.")

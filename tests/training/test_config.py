@@ -167,7 +167,7 @@ def test_a_class_that_a_file_names_is_made_only_where_it_is_given() -> None:
     """Also where it can't be made without one of its settings."""
     run = dataclasses.replace(presets.make("walker_walk", "expert"), reward=Needy(weight=3.0, task_weight=2.0))
     path = f"{Needy.__module__}:Needy"
-    with pytest.raises(InputError, match=f"The reward '{path}' is none of ours"):
+    with pytest.raises(InputError, match=f"The reward '{path}' is not part of this package"):
         Run.from_json(to_json(run))
     assert Run.from_json(to_json(run), {path: Needy}) == run
 

@@ -60,7 +60,7 @@ class Agent(abc.ABC):
         """The state before the first update."""
 
     def observe(self, state: Any, obs: Float[Array, "rows obs"]) -> Any:
-        """The state with its statistics of observations updated with these rows; called before anything is computed from them."""
+        """The state with its statistics of observations updated by these rows; called before any other computation."""
         del obs
         return state
 

@@ -1,4 +1,4 @@
-"""The interface of rewards: a frozen dataclass of settings with pure methods. Everything that changes is in its state, a pytree."""
+"""The interface of rewards: frozen settings with pure methods. Everything that changes is in the state, a pytree."""
 
 from __future__ import annotations
 

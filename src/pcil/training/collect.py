@@ -33,7 +33,7 @@ class Labelled(NamedTuple):
 
 
 def play(run: Run, environments: Sequence[envs.Checked], spec: Spec, state: State, *, learn: bool = True) -> list[Episode]:
-    """Play one episode with exploration in each environment, side by side: act, update, step. Without `learn`, no update is made.
+    """Play one exploring episode in each environment, side by side: act, update, step. Without `learn`, nothing is updated.
 
     An update is dispatched between acting and stepping, so that the device works while the environments step.
     """

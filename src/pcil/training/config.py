@@ -176,7 +176,7 @@ class Run:
             name = values.pop(f"{part}.class")
             if name not in {**known, **(classes or {})}:
                 raise InputError(
-                    f"The {part} {brief(name)} is not part of this package, and code that a file names is not run without --trust."
+                    f"The {part} {brief(name)} is not part of this package, and code that files name is not run unasked."
                 )
             kinds[part] = {**known, **(classes or {})}[name]
         own = {field.name for field in dataclasses.fields(cls)}

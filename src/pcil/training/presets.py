@@ -206,8 +206,8 @@ METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: Any) -> Run:
     """The run of a method with a preset, and any of its settings changed: `seed=2`, `**{"agent.gamma": 0.98}`.
 
-    `agent` and `reward` may be an instance, a name in the registry, or `my.module:MyAgent`. A named agent takes those settings of
-    the preset that it has; another reward than the method's has the defaults of its class. Unknown names raise `InputError`.
+    `agent` and `reward` may be an instance, a name in the registry, or `my.module:MyAgent`. A named agent takes the settings
+    of the preset that it has; another reward than the method's has the defaults of its class. Unknown names raise `InputError`.
     """
     _known("method", method, METHODS)
     _known("preset", preset, PRESETS)

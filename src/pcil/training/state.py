@@ -103,8 +103,8 @@ def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
 
 
 def absorbed(run: Run, episode: Episode) -> Episode:
-    """The episode as the run learns from it. With an absorbing state, an episode that terminated gets as many absorbing steps as
-    it has steps, so that half of what a reward sees of it is its end, whatever its length."""
+    """The episode as the run learns from it. With an absorbing state, an episode that terminated gets as many absorbing
+    steps as it has steps, so that half of what a reward sees of it is its end, whatever its length."""
     return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
 
 

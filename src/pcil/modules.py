@@ -7,7 +7,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -57,11 +57,24 @@ def _of_values(values: Any) -> list[str]:
 def load(option: str, spec: str, base: type, expected: str) -> Any:
     """The subclass of `base` that `module:Class` names; `InputError` says that it must look like what is `expected`."""
     module, _, name = spec.partition(":")
-    try:
+    with _refusing(option, spec, expected):
         kind = getattr(importlib.import_module(module), name)
         if not (isinstance(kind, type) and issubclass(kind, base)):
             raise TypeError(f"{name} is no subclass of pcil.{base.__name__}")
         return kind
+
+
+def made(option: str, spec: str, base: type, expected: str) -> Any:
+    """An instance of that class, made without arguments."""
+    kind = load(option, spec, base, expected)
+    with _refusing(option, spec, expected):
+        return kind()
+
+
+@contextlib.contextmanager
+def _refusing(option: str, spec: str, expected: str) -> Iterator[None]:
+    try:
+        yield
     except Exception as error:  # the module is a person's own and may raise anything
         raise InputError(
             f"{option} {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like {expected}."

@@ -340,7 +340,7 @@ def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) ->
 
 def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
-    monkeypatch.setattr("pcil.cli.train._run", lambda run, out: runs.append(run) or 0)
+    monkeypatch.setattr("pcil.cli.train._run", lambda run, out, callbacks: runs.append(run) or 0)
     assert cli.main(["train", "dmc/walker_walk-v0", "--out", "new"]) == 0
     assert cli.main(["train", "--out", "new", "walker_walk"]) == 0
     assert runs[0] == runs[1] == presets.make("walker_walk")

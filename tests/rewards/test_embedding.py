@@ -14,6 +14,7 @@ import pytest
 
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards import PCIL, TCN, Reward
+from pcil.rewards.base import only
 from pcil.rewards.embedding import Classifier, EmbeddingState, embedding_reward, similarity
 from pcil.training import presets
 from pcil.types import Batch
@@ -46,7 +47,7 @@ def test_the_logit_is_the_reward_even_where_the_sigmoid_saturates() -> None:
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
     classifier = Classifier(MLP((jnp.array([[300.0], [0.0]]),), (jnp.array([-100.0]),)), None)
-    state = EmbeddingState(encoder, None, staying(jnp.ones((4, 2)), jnp.ones((4, 1))), classifier)
+    state = EmbeddingState(encoder, None, only("state", staying(jnp.ones((4, 2)), jnp.ones((4, 1)))), classifier)
     obs = jnp.array([[5.0, 0.0], [-2.0, 0.0], [3.0, 4.0]])
     got = embedding_reward(state, staying(obs, obs), itself, "state", "random")
     assert np.allclose(got, [200.0, -400.0, 80.0], atol=1e-3)

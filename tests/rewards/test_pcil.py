@@ -21,6 +21,7 @@ from jax.test_util import check_grads
 from pcil.nets.losses import gradient_penalty
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.rewards import label
+from pcil.rewards.base import only
 from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.pcil import PCIL, derangement, stages
 from pcil.training import learner
@@ -318,7 +319,7 @@ def test_with_a_task_weight_the_label_is_a_weighted_sum_by_hand() -> None:
     Paid 2 by the task with weight 0.5, it is labelled 0.6 + 1.
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
-    state = EmbeddingState(encoder, None, staying(jnp.array([[1.0, 0.0]]), jnp.zeros((1, 1))), None)
+    state = EmbeddingState(encoder, None, only("state", staying(jnp.array([[1.0, 0.0]]), jnp.zeros((1, 1)))), None)
     obs, action, paid = jnp.array([[0.0, 1.0], [3.0, 4.0], [-1.0, 0.0]]), jnp.zeros((2, 1)), jnp.array([2.0, -4.0])
     for weight, expected in ((0.5, [0.6 + 1, -1 - 2]), (0.0, [0.6, -1])):
         settings = dataclasses.replace(SETTINGS, task_weight=weight)
@@ -351,7 +352,7 @@ def test_actions_make_no_difference() -> None:
         state, _ = update(SETTINGS, state, *map(batches, pair), key=jax.random.key(1))
         embed = {"embed": lambda obs: obs, "key": jax.random.key(2)}
         paid = SETTINGS.reward(state, pair[1], **embed)
-        learned.append([*jax.tree.leaves(state.encoder), paid])
+        learned.append([*jax.tree.leaves(state), paid])
     assert all(np.array_equal(one, other) for one, other in zip(*learned, strict=True))
 
 

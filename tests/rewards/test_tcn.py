@@ -14,6 +14,7 @@ import pytest
 from pcil.errors import InputError
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.nets.optimiser import adam_init
+from pcil.rewards.base import only
 from pcil.rewards.embedding import EmbeddingState
 from pcil.rewards.tcn import TCN
 from pcil.types import Batch
@@ -50,7 +51,7 @@ def phi(obs: Any) -> np.ndarray:
 
 
 def metrics_of(settings: TCN, expert: Batch, agent: Batch, key: Any = KEY) -> dict[str, Any]:
-    state = EmbeddingState(ENCODER, adam_init(ENCODER), staying(jnp.zeros((1, 6)), jnp.zeros((1, 1))), None)
+    state = EmbeddingState(ENCODER, adam_init(ENCODER), only("state", staying(jnp.zeros((1, 6)), jnp.zeros((1, 1)))), None)
     return update(settings, state, expert, agent, key)[1]
 
 
@@ -137,7 +138,10 @@ def test_positives_are_at_most_so_many_steps_away_and_all_of_them_occur() -> Non
     window = Batch.of(obs, ones[..., None], ones, np.zeros(500, np.int32))
 
     def mean_cosine(settings: TCN) -> float:
-        state = EmbeddingState(IDENTITY, adam_init(IDENTITY), staying(jnp.zeros((1, 2)), jnp.zeros((1, 1))), None)
+        reference = only("state", staying(jnp.zeros((1, 2)), jnp.zeros((1, 1))))
+        state = EmbeddingState(IDENTITY, adam_init(IDENTITY), reference, None)
+            IDENTITY, adam_init(IDENTITY), only("state", staying(jnp.zeros((1, 2)), jnp.zeros((1, 1)))), None
+        )
         return float(update(settings, state, window, window, KEY)[1]["positive_similarity"])
 
     assert mean_cosine(narrow(TCN(window=3))) == pytest.approx(np.mean(np.cos([0.5, 1.0, 1.5])), abs=0.05)

@@ -523,8 +523,8 @@ class Spy(Reward):
         raise RuntimeError(*(os.environ.get(name) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "XLA_FLAGS")))
     def update(self, state, expert, agent, embed, *, key):
         return state, {}
-    def reward(self, state, obs, action, embed, *, key):
-        return action[:, 0]
+    def reward(self, state, batch, embed, *, key):
+        return batch.action[:, 0]
 """
 
 

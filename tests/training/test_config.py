@@ -25,13 +25,13 @@ EVERY_RUN = sorted(presets.METHOD_SETTINGS)
 
 
 @dataclass(frozen=True)
-@dataclass(frozen=True)
 class Needy(TaskReward):
     """Has a setting without a default."""
 
     weight: float = field(kw_only=True)
 
 
+@dataclass(frozen=True)
 class WholeEpisodes(TaskReward):
     """Like PWIL's reward, it needs the steps of an episode in order."""
 

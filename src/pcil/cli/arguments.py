@@ -128,7 +128,7 @@ def _callbacks(specs: Sequence[str]) -> "list[Callback]":
     from pcil.training.callbacks import Callback
 
     modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec)], None)
-    return [modules.load("--callbacks", spec, Callback, "my.module:MyLogger")() for spec in specs]
+    return [modules.made("--callbacks", spec, Callback, "my.module:MyLogger") for spec in specs]
 
 
 def _renamed(word: str) -> str:

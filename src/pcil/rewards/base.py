@@ -31,6 +31,12 @@ def select(inputs: Inputs, batch: Batch, embed: Embed) -> Float[Any, "*steps inp
     return jnp.concatenate([embed(batch.obs), other], axis=-1)
 
 
+def only(inputs: Inputs, batch: Batch) -> Batch:
+    """The steps with just those arrays that are `inputs`; the others have no columns."""
+    read = {"state": {"next_obs"}, "state-action": {"obs", "action"}, "transition": {"obs", "next_obs"}}[inputs]
+    return Batch(*(getattr(batch, name)[..., : None if name in read else 0] for name in ("obs", "action", "next_obs")))
+
+
 class SlowFeatures(eqx.Module):
     """A copy of the agent's features that is renewed only every N updates."""
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.nets.losses import binary_cross_entropy
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.nets.optimiser import OptState, adam_init, adam_step
-from pcil.rewards.base import Embed, Inputs, Metrics, select
+from pcil.rewards.base import Embed, Inputs, Metrics, only, select
 from pcil.types import Batch
 
 Head = Literal["similarity", "gail"]
@@ -42,9 +42,9 @@ def init_embedding(
 ) -> EmbeddingState:
     """Three hidden layers and a quarter of their width as output (256-256-256-64: paper Appendix B); random references."""
     encoder_key, reference_key, head_key = jax.random.split(key, 3)
-    steps = Batch(*(jnp.concatenate(arrays) for arrays in zip(*(demo[:3] for demo in demos), strict=True)))
-    rows = jax.random.randint(reference_key, (batch_size,), 0, steps.obs.shape[0])
-    reference = Batch(*(array[rows] for array in steps[:3]))
+    steps = [jnp.concatenate(arrays) for arrays in zip(*(only(inputs, demo)[:3] for demo in demos), strict=True)]
+    rows = jax.random.randint(reference_key, (batch_size,), 0, steps[0].shape[0])
+    reference = Batch(*(array[rows] for array in steps))
     features = jax.eval_shape(lambda: select(inputs, reference, embed)).shape[-1]
     encoder = MLP.init((features, hidden, hidden, hidden, hidden // 4), key=encoder_key)
     linear = MLP.init((hidden // 4, 1), key=head_key) if head == "gail" else None
@@ -89,7 +89,7 @@ def embedding_reward(
     """The head's reward: the similarity, or `log D - log(1 - D)`, which is the classifier's logit itself."""
     if state.classifier is not None:
         return state.classifier.linear(embedding(state, batch, embed, inputs))[:, 0]
-    both = Batch(*(jnp.concatenate(arrays) for arrays in zip(state.reference[:3], batch[:3], strict=True)))
+    both = Batch(*(jnp.concatenate(arrays) for arrays in zip(state.reference[:3], only(inputs, batch)[:3], strict=True)))
     expert, agent = jnp.split(embedding(state, both, embed, inputs), [state.reference.obs.shape[0]])
     return similarity(agent, expert, compare)
 

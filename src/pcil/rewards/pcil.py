@@ -19,7 +19,7 @@ from pcil.errors import check_ranges
 from pcil.nets.losses import gradient_penalty, group_info_nce, info_nce, interpolate
 from pcil.nets.networks import MLP, unit_sphere
 from pcil.nets.optimiser import adam_count
-from pcil.rewards.base import Embed, Inputs, Metrics, Reward, select
+from pcil.rewards.base import Embed, Inputs, Metrics, Reward, only, select
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch
 
@@ -112,7 +112,7 @@ class PCIL(Reward):
         features = [select(self.inputs, batch, embed) for batch in (expert.first, agent.first, state.reference)]
         others: Any = {"episode_id": agent.episode_id, "count": adam_count(state.opt_state), "key": key}
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, *features, **others)
-        state, more = advance(state, gradient, expert.first, features[:2], self.learning_rate)
+        state, more = advance(state, gradient, only(self.inputs, expert.first), features[:2], self.learning_rate)
         return state, metrics | more
 
     def reward(self, state: EmbeddingState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from pcil.errors import check_ranges
 from pcil.nets.losses import contrast, off_diagonal
 from pcil.nets.networks import MLP, unit_sphere
-from pcil.rewards.base import Embed, Metrics, Reward
+from pcil.rewards.base import Embed, Metrics, Reward, only
 from pcil.rewards.embedding import EmbeddingState, Head, advance, embedding, embedding_reward, init_embedding
 from pcil.types import Batch
 
@@ -93,7 +93,7 @@ class TCN(Reward):
         far, real = embed(obs[:, first:last]), goes_on[:, first - 2 : last - 2]  # the end itself is real: hence the 2
         gradient, metrics = jax.grad(self.loss, has_aux=True)(state.encoder, near, far, real)
         anchors = jnp.split(near[0], [len(expert.obs)])
-        state, more = advance(state, gradient, expert.first, anchors, self.learning_rate)
+        state, more = advance(state, gradient, only("state", expert.first), anchors, self.learning_rate)
         return state, metrics | more
 
     def reward(self, state: EmbeddingState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:

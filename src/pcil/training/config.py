@@ -214,12 +214,15 @@ def registered(part: str, path: str) -> str:
     return own.get(name, path) if module.startswith("pcil.") else path
 
 
-def part_of_run(part: str, spec: str) -> Any:
-    """The class with a name in the registry, or the class `my.module:MyClass`, whose module is imported."""
-    if spec in REGISTRIES[part]:
-        return REGISTRIES[part][spec]
+def part_of_run(part: str, spec: str, load: Any = modules.load) -> Any:
+    """The class with a name in the registry, or the class `my.module:MyClass`, whose module is imported.
+
+    With `pcil.modules:made` for `load`, an instance with the default settings.
+    """
+    if kind := REGISTRIES[part].get(spec):
+        return kind if load is modules.load else kind()
     base = {"agent": Agent, "reward": Reward}[part]
-    return modules.load(f"--{part}", spec, base, f"one of {', '.join(REGISTRIES[part])}, or my.module:My{base.__name__}")
+    return load(f"--{part}", spec, base, f"one of {', '.join(REGISTRIES[part])}, or my.module:My{base.__name__}")
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:

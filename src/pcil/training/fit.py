@@ -32,14 +32,18 @@ def fitted(run: Run, demos: Demonstrations, env: gymnasium.Env, say: Callable[[s
                 f"The demonstrations of {demos.task} have no {part}, which {run.method} with these settings reads; give "
                 "demonstrations that have them, or take a method that reads states alone, such as pcil."
             )
-    demos = _of_this_environment(run, demos, env, say)
+    told: list[str] = []
+    demos = _of_this_environment(run, demos, env, told.append)
     if run.clip_actions and demos.has_actions:
-        demos = _clipped(demos, say)
+        demos = _clipped(demos, told.append)
     if not demos.has_actions:
         width = envs.spec(env).action_dim
         episodes = (dataclasses.replace(e, action=np.zeros((len(e), width), np.float32)) for e in demos.episodes)
         demos = dataclasses.replace(demos, episodes=tuple(episodes))
-    return demos.validate(envs.spec(env))
+    demos.validate(envs.spec(env))
+    for text in told:
+        say(text)
+    return demos
 
 
 def _clipped(demos: Demonstrations, say: Callable[[str], None]) -> Demonstrations:

@@ -6,9 +6,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from pcil import modules
 from pcil.errors import InputError, brief
 from pcil.nets.noise import LinearSchedule
 from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed
@@ -214,10 +216,14 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     own, changes = METHOD_SETTINGS[method, preset], renamed(changes)
     settings: dict[str, Any] = {**PRESETS[preset](task), **(own(task) if callable(own) else own)}
     parts = {part: changes.pop(part, settings[part]) for part in REGISTRIES}
-    made = {part: part_of_run(part, named)() if isinstance(named, str) else named for part, named in parts.items()}
-    kept = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)}
-    plain = {name: kept.pop(name) for name in list(kept) if "." not in name}
-    return changed(Run(task=task, method=method, preset=preset, **made, **plain), kept | changes)
+    made = {part: part_of_run(part, named, modules.made) if isinstance(named, str) else named for part, named in parts.items()}
+    settings = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)} | changes
+    for part, instance in made.items():
+        own = {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
+        made[part] = changed(instance, own)
+    known = {field.name for field in dataclasses.fields(Run)}
+    plain = {name: settings.pop(name) for name in list(settings) if name in known}
+    return changed(Run(task=task, method=method, preset=preset, **made, **plain), settings)
 
 
 def _counts(name: str, made: dict[str, Any], settings: dict[str, Any], parts: dict[str, Any]) -> bool:

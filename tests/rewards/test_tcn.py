@@ -140,8 +140,6 @@ def test_positives_are_at_most_so_many_steps_away_and_all_of_them_occur() -> Non
     def mean_cosine(settings: TCN) -> float:
         reference = only("state", staying(jnp.zeros((1, 2)), jnp.zeros((1, 1))))
         state = EmbeddingState(IDENTITY, adam_init(IDENTITY), reference, None)
-            IDENTITY, adam_init(IDENTITY), only("state", staying(jnp.zeros((1, 2)), jnp.zeros((1, 1)))), None
-        )
         return float(update(settings, state, window, window, KEY)[1]["positive_similarity"])
 
     assert mean_cosine(narrow(TCN(window=3))) == pytest.approx(np.mean(np.cos([0.5, 1.0, 1.5])), abs=0.05)

@@ -338,6 +338,52 @@ def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) ->
     )
 
 
+def test_the_settings_of_another_run_train_the_same_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From its `run.json`, and from what that holds as one argument; the folder of the run itself is done."""
+    assert cli.main(["train", "--settings", str(run / "run.json"), "--out", str(run)]) == 0
+    assert "is done" in capsys.readouterr().out
+    settings = json.dumps(json.loads((run / "run.json").read_text())["run"])
+    assert cli.main(["train", "--settings", settings, "--out", "again"]) == 0
+    assert (tmp_path / "again" / "policy" / "policy.json").read_bytes() == (run / "policy" / "policy.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ("nothing.json", "nothing.json holds no settings of a run"),
+        ("{}", "--settings holds no settings of a run"),
+        ('{"agent": {"class": "drqv2"}, "reward": {"class": "pcil"}, "task": "toy/point_mass-v0", "speed": 3}', "speed"),
+        ('{"agent": {"class": "nobody:Agent"}, "reward": {"class": "pcil"}, "task": "walker_walk"}', "--trust nobody"),
+    ],
+)
+def test_settings_that_make_no_run_are_refused(settings: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said in refused(["train", "--settings", settings, "--out", "new"], capsys)
+
+
+def test_a_setting_by_its_older_name_is_taken_and_its_name_of_today_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = []
+    monkeypatch.setattr("pcil.cli.train._run", lambda run, out, callbacks: runs.append(run) or 0)
+    for words in (["--agent.standardise", "False"], ["--agent.normalize-observations=False"]):
+        assert cli.main(["train", "walker_walk", *words, "--out", "new"]) == 0
+    assert runs[0] == runs[1] and not runs[0].agent.normalize_observations
+    assert capsys.readouterr().err == "pcil: --agent.standardise is now called --agent.normalize-observations.\n"
+
+
+def test_a_logger_of_ones_own_is_told_from_the_command_line(demos: str, tmp_path: Path) -> None:
+    (tmp_path / "my_logger.py").write_text(
+        "from pathlib import Path\n"
+        "from pcil import Callback\n"
+        "class Logger(Callback):\n"
+        "    def episode(self, row):\n"
+        "        with Path('told.txt').open('a') as file:\n"
+        "            file.write(f\"{row['episode']} {row['frames']}\\n\")\n"
+    )
+    assert cli.main([*narrow_run(demos, tmp_path / "run"), "--callbacks", "my_logger:Logger"]) == 0
+    assert (tmp_path / "told.txt").read_text().splitlines() == [f"{i} {50 * i}" for i in range(1, 7)]
+
+
 def test_a_long_name_of_a_task_is_its_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
     runs = []
     monkeypatch.setattr("pcil.cli.train._run", lambda run, out, callbacks: runs.append(run) or 0)

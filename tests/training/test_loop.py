@@ -189,7 +189,7 @@ def test_callbacks_are_told_every_row_and_every_evaluation_and_what_was_logged_b
 
 @pytest.mark.parametrize("num_envs", [2, 3])
 def test_several_environments_are_played_side_by_side_and_resume_exactly(num_envs: int, demos: str, tmp_path: Path) -> None:
-    run = small_run(demos=demos, num_envs=num_envs)
+    run = small_run(demos=demos, num_envs=num_envs, random_frames=200)
     finish(run, tmp_path / "whole")
     _, lines = rows(tmp_path / "whole")
     assert [line["episode"] for line in lines] == [1, 2, 3, 4, 5, 6]
@@ -202,7 +202,7 @@ def test_several_environments_are_played_side_by_side_and_resume_exactly(num_env
 
 
 def one_by_one(demos: str, folder: Path) -> list[dict[str, Any]]:
-    """The rows of the same run in one environment, whose first episodes are the same: nothing is learned before 100 frames."""
+    """The rows of the same run in one environment, whose first episodes are the same: they are random."""
     finish(small_run(demos=demos, random_frames=200), folder / "single")
     return rows(folder / "single")[1]
 
@@ -606,6 +606,33 @@ def test_without_a_whole_checkpoint_the_run_begins_again_and_says_so(demos: str,
     runs.execute(run, tmp_path / "lost", [listener])
     assert any("no whole checkpoint" in text and "begins again" in text for text in listener.said)
     same_run(tmp_path / "whole", tmp_path / "lost")
+
+
+def test_a_run_of_an_older_version_resumes_exactly(demos: str, tmp_path: Path) -> None:
+    """Its arrays and settings had other names, its classes were named by their paths, and its reward kept states alone."""
+    run, folder = small_run(demos=demos), tmp_path / "older"
+    finish(run, tmp_path / "whole")
+    with pytest.raises(loop.Stopped):
+        runs.execute(run, folder, [StopAfter(4)])
+    arrays, meta, _ = checkpoint.restore(folder / "checkpoint")
+    assert arrays is not None
+    older = {name: array for name, array in arrays.items() if not name.endswith((".reference.obs", ".reference.action"))}
+    older = {
+        name.replace("opt_state", "moments").replace(".reference.next_obs", ".reference"): array
+        for name, array in older.items()
+    }
+    assert "learner.reward.reference" in older and any("moments" in name for name in older)
+    checkpoint.save(folder / "checkpoint", meta["counters"]["frames"], older, meta)
+    about = json.loads((folder / "run.json").read_text())
+    settings = about["run"]
+    settings["agent"]["standardise"] = settings["agent"].pop("normalize_observations")
+    settings["agent"]["class"], settings["reward"]["class"] = "pcil.agents.drqv2:DrQV2", "pcil.rewards.pcil:PCIL"
+    del settings["num_envs"], settings["reward"]["inputs"]
+    (folder / "run.json").write_text(json.dumps(about))
+    told = StopAfter(-1)
+    runs.execute(run, folder, [told])
+    assert "Resuming at 200 of 300 frames." in told.said
+    same_run(tmp_path / "whole", folder)
 
 
 def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
     argv = [_renamed(word) for word in argv]
     given = peek(argv)
     if "settings" in given:
-        return call("train", functools.partial(_train_again, execute), argv)
+        return _train_again(argv, execute)
     task = envs.task_name(given.get("task", "walker_walk"))
     changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
     for part in REGISTRIES.keys() & given.keys():
@@ -88,21 +88,23 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
     return call("train", train, argv)
 
 
-def _train_again(
-    execute: Callable[["Run", Path, "Sequence[Callback]"], int],
-    settings: str,
-    out: Path,
-    callbacks: tuple[str, ...] = (),
-    trust: Trust = (),
-) -> int:
-    """Train a policy with the settings of another run, or resume where a run stopped.
+def _train_again(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"], int]) -> int:
+    def train(settings: str, out: Path, callbacks: tuple[str, ...] = (), trust: Trust = ()) -> int:
+        """Train a policy with the settings of another run, or resume where a run stopped.
 
-    Args:
-        settings: The run.json of a run, or what it holds, as one word of JSON.
-        out: The run's folder; one that holds the same run resumes it.
-        callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
-        trust: Modules that the settings may name, whose code is then run, such as my.module.
-    """
+        Args:
+            settings: The run.json of a run, or its content as one argument in JSON.
+            out: The run's folder; one that holds the same run resumes it.
+            callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
+            trust: Modules that the settings may name, whose code is then run, such as my.module.
+        """
+        return execute(_run_of(settings, trust), out, _callbacks(callbacks))
+
+    return call("train", train, argv)
+
+
+def _run_of(settings: str, trust: Sequence[str]) -> "Run":
+    """The run of a `run.json`, by its path or its content; `trust` are the modules that it may name."""
     from pcil import files, modules
     from pcil.training.config import REGISTRIES, Run, part_of_run
 
@@ -112,14 +114,16 @@ def _train_again(
         flat = files.flat(table.get("run", table))
         classes = {}
         for part in REGISTRIES:
-            if named := modules.of_class(flat[f"{part}.class"]):
+            if named := modules.of_class(path := flat[f"{part}.class"]):
                 modules.admit(source, named, trust)
-                classes[flat[f"{part}.class"]] = part_of_run(part, flat[f"{part}.class"])
+                classes[path] = part_of_run(part, path)
         run = Run.from_json(flat, classes)
+    except InputError:
+        raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{source} holds no settings of a run ({error}); give the run.json of one.") from error
     modules.admit(source, modules.of_task(run.task, run.env_kwargs), trust)
-    return execute(run, out, _callbacks(callbacks))
+    return run
 
 
 def _callbacks(specs: Sequence[str]) -> "list[Callback]":

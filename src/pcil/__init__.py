@@ -9,7 +9,7 @@ Names load on first use, so that `import pcil` and `pcil --help` stay fast.
 
 import importlib
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 __all__ = [
     "Agent",
     "Callback",

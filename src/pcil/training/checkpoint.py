@@ -95,7 +95,7 @@ def _read(path: Path) -> tuple[Arrays, dict[str, Any]]:
 
 
 def _read_orbax(folder: Path) -> Arrays:
-    """The arrays of a checkpoint of before version 0.2, which Orbax wrote."""
+    """The arrays of a checkpoint of before 2026-11-26, which Orbax wrote."""
     try:
         import orbax.checkpoint as ocp
     except ImportError as error:

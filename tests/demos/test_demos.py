@@ -449,7 +449,7 @@ def test_a_line_of_the_table_says_what_its_row_says() -> None:
     heading, line, untold = demos.table([row, row | {"seeds_tried": None}])
     told = ["walker_walk", "24", "6", "10", "5000", "961.0", "+-", "12.3", "940.0", "976.0", "3", "01234567", "DrQ-v2"]
     assert line.split() == told and untold.split() == [word for word in told if word != "3"]
-    assert heading.split() == "task obs act episodes steps return min max tries hash expert".split()
+    assert heading.split() == ["task", "obs", "act", "episodes", "steps", "return", "min", "max", "tries", "hash", "expert"]
     assert len(untold) == len(line) and heading.index("hash") == line.index("01234567") == untold.index("01234567")
 
 

@@ -36,6 +36,9 @@ OPERATORS = [
     *(f"core/{name}" for name in ("NumberReplacer", "AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue")),
     *(f"core/{name}" for name in ("ReplaceAndWithOr", "ReplaceOrWithAnd", "ZeroIterationForLoop")),
 ]
+HEAVY = ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest", "beartype", "h5py", "tyro", "minari"]
+HEAVY += ["orbax.checkpoint", "ot", "mujoco"]
+"""What is imported once, so that no child has to; POT alone takes seconds."""
 SYMMETRIC = {"minimum", "maximum", "min", "max"}
 """Functions of two arguments that may be swapped."""
 
@@ -178,8 +181,8 @@ def main() -> int:
     os.chdir(ROOT)
     os.environ.setdefault("MUJOCO_GL", "disabled")
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a change is compiled anew, and then runs for milliseconds
-    for heavy in ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest"]:
-        importlib.import_module(heavy)  # so that no child has to
+    for heavy in HEAVY:
+        importlib.import_module(heavy)
 
     texts = {name: (ROOT / "src/pcil" / f"{name}.py").read_text() for name in chosen}
     every = [mutant for name, text in texts.items() for mutant in mutants(name, text)]

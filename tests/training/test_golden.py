@@ -24,8 +24,8 @@ TOLERANCE = 1e-4
 """Relative. Another processor or release of XLA adds in another order, which changes the last bits. With every first weight
 moved by its last bit the numbers moved by at most 2.5e-6."""
 NEARLY_TIED = 0.03
-"""Share of the pairs of an update whose two scores differ by rounding alone: an accuracy may count them either way. It was 0.025
-where XLA was told to leave out most optimisations (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as `mutants.py` does)."""
+"""Share of the pairs of an update whose two scores differ by rounding alone, so that an accuracy may count them either way. It
+was 0.025 where XLA was told to leave out most optimisations (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as `mutants.py` does)."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:

@@ -556,7 +556,7 @@ def test_an_episode_that_returns_just_the_minimum_is_kept() -> None:
     assert best.info["record_minimum_return"] == max(returns)
 
 
-@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-2.0, 1.0), (-1.0, 3.0), (0.0, 4.0)])
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-2.0, 1.0), (0.0, 1.0), (-1.0, 2.0), (-1.0, 0.0)])
 def test_recorded_actions_are_brought_from_their_bounds_to_the_unit_box(low: float, high: float) -> None:
     env = TinyEnv()
     env.action_space = spaces.Box(low, high, (1,), np.float32)

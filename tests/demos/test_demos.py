@@ -292,6 +292,24 @@ def test_validate_compares_with_the_environment() -> None:
     assert "Episode 3" in refusal(lambda: dataclasses.replace(original, episodes=ragged).validate(None))
 
 
+def test_arrays_that_are_no_rows_of_numbers_are_refused() -> None:
+    """Whoever makes an `Episode` has its types checked in these tests alone."""
+    for name, shape in (("obs", (6,)), ("obs", (6, 0)), ("action", (5,)), ("action", (5, 0))):
+        episode = make_episode()
+        object.__setattr__(episode, name, np.zeros(shape, np.float32))
+        given = Demonstrations("walker_walk", (episode,), {})
+        message = refusal(lambda given=given: given.validate(None))
+        assert "each must be rows of at least one number" in message and str(shape) in message
+    object.__setattr__(episode := make_episode(), "action", np.zeros((5, 0), np.float32))
+    assert Demonstrations("walker_walk", (episode,), {}, has_actions=False).validate(None).num_steps == 5
+
+
+def test_clipping_leaves_what_is_within_the_bounds_and_brings_the_rest_to_them() -> None:
+    action = np.array([[-3.0], [-1.0], [-0.5], [0.25], [1.0], [1.5]], np.float32)
+    given = Demonstrations("walker_walk", (make_episode(6, action=action), make_episode(6, action=action / 2)), {})
+    np.testing.assert_array_equal(given.clip().action[:, 0], [-1, -1, -0.5, 0.25, 1, 1, -1, -0.5, -0.25, 0.125, 0.5, 0.75])
+
+
 # --- Datasets of others ---
 
 
@@ -461,7 +479,7 @@ def test_take_gives_the_first_episodes_or_refuses() -> None:
         assert "1 to 3" in refusal(lambda n=n: original.take(n))
 
 
-def test_arrays_become_episodes_and_what_is_absent_is_known() -> None:
+def test_arrays_become_episodes_and_what_is_absent_is_known(tmp_path: Path) -> None:
     obs, action, reward = np.arange(8.0).reshape(4, 2), np.full((3, 1), 0.5), [1.0, 2.0, 3.0]
     whole = Demonstrations.from_arrays([obs, obs], [action, action], [reward, reward], [True, False])
     assert whole.has_actions and whole.has_rewards and [e.terminated for e in whole.episodes] == [True, False]
@@ -470,6 +488,8 @@ def test_arrays_become_episodes_and_what_is_absent_is_known() -> None:
     bare = Demonstrations.from_arrays([obs], task="mine", info={"from": "me"})
     assert not bare.has_actions and not bare.has_rewards and bare.return_mean is None and bare.return_std is None
     assert bare.task == "mine" and bare.info == {"from": "me"}
+    again = Demonstrations.load(bare.save(tmp_path / "bare"))
+    assert not again.has_actions and not again.has_rewards and again.hash == bare.hash
     assert "have no actions" in refusal(lambda: bare.action) and "have no rewards" in refusal(lambda: bare.returns)
     assert Demonstrations.from_arrays([obs], [action]).has_actions
     assert Demonstrations.from_arrays([obs], rewards=[reward]).has_rewards

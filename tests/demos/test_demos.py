@@ -304,6 +304,25 @@ def test_arrays_that_are_no_rows_of_numbers_are_refused() -> None:
     assert Demonstrations("walker_walk", (episode,), {}, has_actions=False).validate(None).num_steps == 5
 
 
+def test_a_shape_that_does_not_fit_is_said_to_be_of_the_environment_or_of_the_first_episode() -> None:
+    both = Demonstrations("walker_walk", (make_episode(), make_episode(obs_dim=4)), {})
+    expected = (
+        "Episode 1 of the demonstrations of walker_walk has obs of shape (6, 4), but after the first episode it must be (6, 3)."
+    )
+    assert refusal(lambda: both.validate(None)) == expected
+    expected = (
+        "Episode 0 of the demonstrations of walker_walk has obs of shape (6, 3), but in this environment it must be (6, 4)."
+    )
+    assert refusal(lambda: both.validate(Spec(4, 2, 1))) == expected
+
+
+def test_demonstrations_do_not_change_and_are_equal_to_themselves_alone() -> None:
+    one, two = make_demos(), make_demos()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        one.task = "another"  # type: ignore[misc]
+    assert one == one and one != two and len({one, two}) == 2
+
+
 def test_clipping_leaves_what_is_within_the_bounds_and_brings_the_rest_to_them() -> None:
     action = np.array([[-3.0], [-1.0], [-0.5], [0.25], [1.0], [1.5]], np.float32)
     given = Demonstrations("walker_walk", (make_episode(6, action=action), make_episode(6, action=action / 2)), {})
@@ -594,5 +613,10 @@ def test_a_bad_recording_is_refused() -> None:
     options = {"task": "tiny", "seed": 1, "info": {}}
     wild = refusal(lambda: demos.record(lambda obs: np.array([2.0]), TinyEnv(), 1, **options))
     assert "from 2 to 2" in wild
+    free, choice = TinyEnv(), TinyEnv()
+    free.action_space, choice.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32), spaces.MultiBinary(1)
+    for env in (free, choice):
+        unbounded = refusal(lambda env=env: demos.record(lambda obs: np.zeros(1, np.int8), env, 1, **options))
+        assert "need actions in a Box with finite bounds" in unbounded
     broken = refusal(lambda: demos.record(push, Odd(episode=2, reward=np.nan), 3, **options))
     assert "recorded episode 2" in broken

@@ -207,6 +207,7 @@ def counted(updates: int, finite: list[int], agent: Any = 1.0) -> Learner:
         ([5, 3, 3, 3, 3, 3, 3], ("reward/a and reward/b", 3)),
         ([5, 5, 5, 0, 0, 0, 0], ("the rewards of the batch", 0)),
         ([3, 3, 3, 3, 3, 3, 3], ("the agent's parameters", 2)),
+        ([3, 5, 5, 5, 5, 5, 5], ("the agent's parameters", 2)),
     ],
 )
 def test_what_was_first_is_named_and_losses_of_one_part_together(finite: list[int], found: Any) -> None:

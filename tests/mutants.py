@@ -39,6 +39,8 @@ OPERATORS = [
 HEAVY = ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest", "beartype", "h5py", "tyro", "minari"]
 HEAVY += ["orbax.checkpoint", "ot", "mujoco"]
 """What is imported once, so that no child has to; POT alone takes seconds."""
+LONGEST = 60
+"""Seconds that one test may take: a change can make a loop endless."""
 SYMMETRIC = {"minimum", "maximum", "min", "max"}
 """Functions of two arguments that may be swapped."""
 
@@ -135,6 +137,13 @@ def parses(code: str) -> bool:
     return True
 
 
+class Alarm:
+    """Ends the process where a test takes too long, in compiled code too."""
+
+    def pytest_runtest_logstart(self) -> None:
+        signal.alarm(LONGEST)
+
+
 def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
     """Whether one of the tests fails, or takes longer than so many seconds; and how long they took."""
     began, child = time.monotonic(), os.fork()
@@ -150,7 +159,7 @@ def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
         code = 1
         words = "-x -q -n 0 -p no:cacheprovider --durations 0 -W ignore::pytest.PytestAssertRewriteWarning"
         try:
-            code = int(pytest.main([*words.split(), *tests]))
+            code = int(pytest.main([*words.split(), *tests], plugins=[Alarm()]))
         finally:
             os._exit(code)
     while time.monotonic() - began < limit:

@@ -36,6 +36,11 @@ OPERATORS = [
     *(f"core/{name}" for name in ("NumberReplacer", "AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue")),
     *(f"core/{name}" for name in ("ReplaceAndWithOr", "ReplaceOrWithAnd", "ZeroIterationForLoop")),
 ]
+HEAVY = ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest", "beartype", "h5py", "tyro", "minari"]
+HEAVY += ["orbax.checkpoint", "ot", "mujoco"]
+"""What is imported once, so that no child has to; POT alone takes seconds."""
+LONGEST = 60
+"""Seconds that one test may take: a change can make a loop endless."""
 SYMMETRIC = {"minimum", "maximum", "min", "max"}
 """Functions of two arguments that may be swapped."""
 
@@ -132,6 +137,13 @@ def parses(code: str) -> bool:
     return True
 
 
+class Alarm:
+    """Ends the process where a test takes too long, in compiled code too."""
+
+    def pytest_runtest_logstart(self) -> None:
+        signal.alarm(LONGEST)
+
+
 def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
     """Whether one of the tests fails, or takes longer than so many seconds; and how long they took."""
     began, child = time.monotonic(), os.fork()
@@ -147,7 +159,7 @@ def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
         code = 1
         words = "-x -q -n 0 -p no:cacheprovider --durations 0 -W ignore::pytest.PytestAssertRewriteWarning"
         try:
-            code = int(pytest.main([*words.split(), *tests]))
+            code = int(pytest.main([*words.split(), *tests], plugins=[Alarm()]))
         finally:
             os._exit(code)
     while time.monotonic() - began < limit:
@@ -169,6 +181,7 @@ def main() -> int:
     parser.add_argument("files", nargs="*", help=f"from src/pcil without .py: {', '.join(guards)}; a folder means its files")
     parser.add_argument("--number", "-n", type=int, help="how many mutants, drawn at random; by default all of them")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
+    parser.add_argument("--skip", type=int, default=0, help="leave out so many of the first, to go on with a campaign")
     options = parser.parse_args()
     called = {name: {name, *name.split("/")} for name in guards}
     chosen = [name for name in guards if not options.files or called[name] & set(options.files)]
@@ -176,8 +189,9 @@ def main() -> int:
         parser.error(f"no tests guard {', '.join(missing)}; the files are {', '.join(guards)}")
     os.chdir(ROOT)
     os.environ.setdefault("MUJOCO_GL", "disabled")
-    for heavy in ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest"]:
-        importlib.import_module(heavy)  # so that no child has to
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a change is compiled anew, and then runs for milliseconds
+    for heavy in HEAVY:
+        importlib.import_module(heavy)
 
     texts = {name: (ROOT / "src/pcil" / f"{name}.py").read_text() for name in chosen}
     every = [mutant for name, text in texts.items() for mutant in mutants(name, text)]
@@ -185,7 +199,7 @@ def main() -> int:
         every = sorted(
             random.Random(options.seed).sample(every, options.number), key=lambda m: (chosen.index(m.file), m.number)
         )
-    survivors: list[Mutant] = []
+    every, survivors = every[options.skip :], list[Mutant]()
     sys.dont_write_bytecode = True
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
@@ -196,8 +210,10 @@ def main() -> int:
             if failed:
                 print(f"The tests that guard {name} fail as it is: {' '.join(guards[name])}")
                 return 2
-            path, left = copy / "pcil" / f"{name}.py", len(survivors)
-            for mutant in own:
+            path, left, began = copy / "pcil" / f"{name}.py", len(survivors), time.monotonic()
+            for done, mutant in enumerate(own):
+                if done % 10 == 0:
+                    print(f"{name}: {done} of {len(own)} after {time.monotonic() - began:.0f} s", file=sys.stderr, flush=True)
                 path.write_text(mutant.code)
                 if not killed(copy, guards[name], 20 + 3 * seconds)[0]:
                     survivors.append(mutant)

@@ -179,3 +179,12 @@ def test_the_actor_is_not_trained_in_the_absorbing_state_and_leaves_without_its_
     obs = random_batch(5, 2, 2).obs
     padded = np.pad(obs, ((0, 0), (0, 1)))
     assert np.allclose(ABSORBING.actor(state)(jnp.asarray(obs)), state.actor(jnp.asarray(padded)), atol=1e-6)
+
+
+@pytest.mark.parametrize("first", [0.0, 1.0])
+def test_whether_a_window_trains_the_actor_is_said_by_its_first_state(first: float) -> None:
+    state, window = ABSORBING.init(SPEC, key=jax.random.key(0)), make_window()
+    window = window._replace(obs=window.obs.at[:, 0, -1].set(first).at[:, 1:, -1].set(1 - first))
+    after, _ = ABSORBING.update(state, window, step=jnp.int32(0), key=jax.random.key(1))
+    same = [np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after.actor), jax.tree.leaves(state.actor), strict=True)]
+    assert all(same) if first else not any(same)

@@ -149,6 +149,14 @@ def test_acting_noise_follows_the_schedule(correlation: float) -> None:
     assert large > 10, "noise_clip bounds the updates alone"
 
 
+def test_white_acting_noise_is_the_schedules_deviation_times_the_generators_draws() -> None:
+    explore, draws = AGENT.explorer(2, np.random.default_rng(7)), np.random.default_rng(7)
+    for step, deviation in DEVIATION.items():
+        noise = deviation * draws.standard_normal(2, dtype=np.float32)
+        got = explore(resting(), np.zeros(3, np.float32), step)
+        assert np.allclose(got, np.clip(noise, -1 + 1e-6, 1 - 1e-6), atol=1e-6)
+
+
 def test_the_noise_of_updates_follows_the_schedule_and_its_two_draws_are_independent(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the target and the actor's loss are given, unclipped: 1000 draws each, of the deviation that the step has."""
     agent = dataclasses.replace(AGENT, noise_clip=100.0, batch_size=500)

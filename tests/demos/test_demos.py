@@ -154,6 +154,14 @@ def test_a_save_leaves_all_or_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+def test_a_save_makes_sure_first_that_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice the arrays, 64 KiB an episode and 1 MiB, by hand: 12 steps with 15 observations of 3 numbers and 2 of an action."""
+    asked: list[int] = []
+    monkeypatch.setattr(demos.files, "reserve", lambda folder, size: asked.append(size))
+    make_demos(5, 3, 4).save(tmp_path / "mine")
+    assert asked == [2 * (15 * 3 * 4 + 12 * 2 * 4 + 12 * 8) + 3 * 65536 + 1048576]
+
+
 def test_a_save_that_can_not_be_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("here")
     assert "can not be written" in refusal(lambda: make_demos().save(tmp_path / "file" / "mine"))
@@ -282,6 +290,43 @@ def test_validate_compares_with_the_environment() -> None:
     assert "no episodes" in refusal(lambda: dataclasses.replace(original, episodes=()).validate(None))
     ragged = (*original.episodes, make_episode(obs_dim=4))
     assert "Episode 3" in refusal(lambda: dataclasses.replace(original, episodes=ragged).validate(None))
+
+
+def test_arrays_that_are_no_rows_of_numbers_are_refused() -> None:
+    """Whoever makes an `Episode` has its types checked in these tests alone."""
+    for name, shape in (("obs", (6,)), ("obs", (6, 0)), ("action", (5,)), ("action", (5, 0))):
+        episode = make_episode()
+        object.__setattr__(episode, name, np.zeros(shape, np.float32))
+        given = Demonstrations("walker_walk", (episode,), {})
+        message = refusal(lambda given=given: given.validate(None))
+        assert "each must be rows of at least one number" in message and str(shape) in message
+    object.__setattr__(episode := make_episode(), "action", np.zeros((5, 0), np.float32))
+    assert Demonstrations("walker_walk", (episode,), {}, has_actions=False).validate(None).num_steps == 5
+
+
+def test_a_shape_that_does_not_fit_is_said_to_be_of_the_environment_or_of_the_first_episode() -> None:
+    both = Demonstrations("walker_walk", (make_episode(), make_episode(obs_dim=4)), {})
+    expected = (
+        "Episode 1 of the demonstrations of walker_walk has obs of shape (6, 4), but after the first episode it must be (6, 3)."
+    )
+    assert refusal(lambda: both.validate(None)) == expected
+    expected = (
+        "Episode 0 of the demonstrations of walker_walk has obs of shape (6, 3), but in this environment it must be (6, 4)."
+    )
+    assert refusal(lambda: both.validate(Spec(4, 2, 1))) == expected
+
+
+def test_demonstrations_do_not_change_and_are_equal_to_themselves_alone() -> None:
+    one, two = make_demos(), make_demos()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        one.task = "another"  # type: ignore[misc]
+    assert one == one and one != two and len({one, two}) == 2
+
+
+def test_clipping_leaves_what_is_within_the_bounds_and_brings_the_rest_to_them() -> None:
+    action = np.array([[-3.0], [-1.0], [-0.5], [0.25], [1.0], [1.5]], np.float32)
+    given = Demonstrations("walker_walk", (make_episode(6, action=action), make_episode(6, action=action / 2)), {})
+    np.testing.assert_array_equal(given.clip().action[:, 0], [-1, -1, -0.5, 0.25, 1, 1, -1, -0.5, -0.25, 0.125, 0.5, 0.75])
 
 
 # --- Datasets of others ---
@@ -434,12 +479,39 @@ def test_the_table_of_what_ships_is_read_from_the_data(library: Path, monkeypatc
     assert "none ship" in refusal(lambda: Demonstrations.load("walker_walk"))
 
 
+def test_a_line_of_the_table_says_what_its_row_says() -> None:
+    row = {"task": "walker_walk", "observation_dim": 24, "action_dim": 6, "episodes": 10, "steps": 5000}
+    row |= {"return_mean": 961.04, "return_std": 12.35, "return_min": 940.0, "return_max": 975.96}
+    row |= {"seeds_tried": 3, "hash": "0123456789abcdef", "expert": "DrQ-v2"}
+    heading, line, untold = demos.table([row, row | {"seeds_tried": None}])
+    told = ["walker_walk", "24", "6", "10", "5000", "961.0", "+-", "12.3", "940.0", "976.0", "3", "01234567", "DrQ-v2"]
+    assert line.split() == told and untold.split() == [word for word in told if word != "3"]
+    assert heading.split() == ["task", "obs", "act", "episodes", "steps", "return", "min", "max", "tries", "hash", "expert"]
+    assert len(untold) == len(line) and heading.index("hash") == line.index("01234567") == untold.index("01234567")
+
+
 def test_take_gives_the_first_episodes_or_refuses() -> None:
     original = make_demos()
     assert original.take(2).episodes == original.episodes[:2]
     assert original.take(3).episodes == original.take(None).episodes == original.episodes
     for n in (0, -1, 4):
         assert "1 to 3" in refusal(lambda n=n: original.take(n))
+
+
+def test_arrays_become_episodes_and_what_is_absent_is_known(tmp_path: Path) -> None:
+    obs, action, reward = np.arange(8.0).reshape(4, 2), np.full((3, 1), 0.5), [1.0, 2.0, 3.0]
+    whole = Demonstrations.from_arrays([obs, obs], [action, action], [reward, reward], [True, False])
+    assert whole.has_actions and whole.has_rewards and [e.terminated for e in whole.episodes] == [True, False]
+    np.testing.assert_array_equal(whole.obs, np.concatenate([obs[:-1], obs[:-1]]))
+    assert whole.returns.tolist() == [6, 6] and whole.task == "arrays" and whole.info == {}
+    bare = Demonstrations.from_arrays([obs], task="mine", info={"from": "me"})
+    assert not bare.has_actions and not bare.has_rewards and bare.return_mean is None and bare.return_std is None
+    assert bare.task == "mine" and bare.info == {"from": "me"}
+    again = Demonstrations.load(bare.save(tmp_path / "bare"))
+    assert not again.has_actions and not again.has_rewards and again.hash == bare.hash
+    assert "have no actions" in refusal(lambda: bare.action) and "have no rewards" in refusal(lambda: bare.returns)
+    assert Demonstrations.from_arrays([obs], [4 * action]).action.max() == 2, "what is out of bounds is for `clip`"
+    assert Demonstrations.from_arrays([obs], rewards=[reward]).has_rewards
 
 
 def test_rows_pair_each_action_with_the_state_it_was_taken_in() -> None:
@@ -516,8 +588,35 @@ def test_only_good_episodes_are_kept() -> None:
     assert "Only 0 of 30 episodes" in refusal(lambda: record_tiny(minimum_return=1e9))
 
 
+def test_an_episode_that_returns_just_the_minimum_is_kept() -> None:
+    returns = [episode.total_reward for episode in record_tiny(episodes=20).episodes]
+    best = record_tiny(episodes=1, minimum_return=max(returns))
+    assert best.return_mean == max(returns) and best.info["record_attempts"] == returns.index(max(returns)) + 1
+    assert best.info["record_minimum_return"] == max(returns)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-2.0, 1.0), (0.0, 1.0), (-1.0, 2.0), (-1.0, 0.0)])
+def test_recorded_actions_are_brought_from_their_bounds_to_the_unit_box(low: float, high: float) -> None:
+    env = TinyEnv()
+    env.action_space = spaces.Box(low, high, (1,), np.float32)
+    share = [0.0, 0.25, 0.5, 1.0]
+    given = iter(low + (high - low) * np.array(share))
+    kept = demos.record(lambda obs: np.array([next(given)]), env, 1, task="tiny", seed=1, info={})
+    np.testing.assert_allclose(kept.action[:, 0], [-1, -0.5, 0, 1][: kept.num_steps], atol=1e-6)
+    assert kept.action.dtype == np.float32
+
+
 def test_a_bad_recording_is_refused() -> None:
+    for unreachable in (np.inf, np.nan):
+        assert "that an episode can reach" in refusal(lambda most=unreachable: record_tiny(minimum_return=most))
     assert "at least 1" in refusal(lambda: record_tiny(episodes=0))
     options = {"task": "tiny", "seed": 1, "info": {}}
     wild = refusal(lambda: demos.record(lambda obs: np.array([2.0]), TinyEnv(), 1, **options))
     assert "from 2 to 2" in wild
+    free, choice = TinyEnv(), TinyEnv()
+    free.action_space, choice.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32), spaces.MultiBinary(1)
+    for env in (free, choice):
+        unbounded = refusal(lambda env=env: demos.record(lambda obs: np.zeros(1, np.int8), env, 1, **options))
+        assert "need actions in a Box with finite bounds" in unbounded
+    broken = refusal(lambda: demos.record(push, Odd(episode=2, reward=np.nan), 3, **options))
+    assert "recorded episode 2" in broken

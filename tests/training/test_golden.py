@@ -23,6 +23,9 @@ CASES = make_golden.cases()
 TOLERANCE = 1e-4
 """Relative. Another processor or release of XLA adds in another order, which changes the last bits. With every first weight
 moved by its last bit the numbers moved by at most 2.5e-6."""
+NEARLY_TIED = 0.03
+"""Share of the pairs of an update whose two scores differ by rounding alone, so that an accuracy may count them either way. It
+was 0.025 where XLA was told to leave out most optimisations (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as `mutants.py` does)."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:
@@ -37,7 +40,10 @@ def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from
 def test_five_updates_give_the_numbers_that_they_gave(name: str) -> None:
     """A part's second sum has terms of both signs, so its tolerance is that of the first, the sum of their sizes."""
     got, expected = make_golden.five_updates(CASES[name]), GOLDEN["cases"][name]
-    assert got["metrics"] == pytest.approx(expected["metrics"], rel=TOLERANCE, abs=1e-5)
+    assert got["metrics"].keys() == expected["metrics"].keys()
+    for part, value in got["metrics"].items():
+        absolute = NEARLY_TIED if part.endswith("accuracy") else 1e-5
+        assert value == pytest.approx(expected["metrics"][part], rel=TOLERANCE, abs=absolute), part
     assert got["sums"].keys() == expected["sums"].keys()
     far = {part: (sums, old) for part, sums in got["sums"].items() if distance(sums, old := expected["sums"][part]) > TOLERANCE}
     assert not far, f"if this was meant: {make_golden.COMMAND}"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import re
 import warnings
 from collections.abc import Iterator, Mapping
+from math import isfinite
 from typing import Any
 
 import gymnasium
@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from pcil.errors import InputError, RunError, brief
 
-_FLOAT32 = np.dtype(np.float32)
+_ARRAY, _FLOAT32 = np.ndarray, np.dtype(np.float32)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -70,7 +70,7 @@ class Checked(gymnasium.Wrapper):
         return self._observation(result[0]), dict(result[1] or {})
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Any]:
-        if not self._is_plain(action, self._action_shape):
+        if not _is_plain(action, self._action_shape):
             action = self.checked_action(action)
         self._steps += 1
         if self._longest is not None and self._steps > self._longest:
@@ -92,7 +92,7 @@ class Checked(gymnasium.Wrapper):
         if not isinstance(result, (tuple, list)) or len(result) != 5:
             raise self._refused(result, "from step", "(observation, reward, terminated, truncated, info)")
         obs, reward, terminated, truncated, info = result
-        row = obs.copy() if self._is_plain(obs, self._shape) else self._observation(obs)
+        row = obs.copy() if _is_plain(obs, self._shape) else self._observation(obs)
         if type(reward) is not float or not -_LARGEST <= reward <= _LARGEST:
             reward = self._reward(reward)
         if type(terminated) is not bool:
@@ -119,16 +119,6 @@ class Checked(gymnasium.Wrapper):
                 if where := np.argwhere(~np.isfinite(part.astype(np.float32))).tolist():
                     raise self._not_finite(part[tuple(where[0])], f"returned an {path} whose {_entry(where[0])}")
         raise AssertionError("a part of what is not finite is not finite")
-
-    @staticmethod
-    def _is_plain(array: Any, shape: tuple[int, ...] | None) -> bool:
-        """Whether it is what nearly all are, a finite float32 vector of this shape: a quick test in each step.
-
-        The sum of squares is infinite for large finite values too, which the slower test of all else then takes.
-        """
-        if type(array) is not np.ndarray or array.dtype is not _FLOAT32 or array.shape != shape:
-            return False
-        return math.isfinite(sum(array.tolist()) if array.size < 16 else np.vdot(array, array))
 
     def _parts(self, space: spaces.Space, value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
         """The array of each Box in a space, with the path to it, in the order in which Gymnasium flattens them."""
@@ -199,6 +189,16 @@ class Checked(gymnasium.Wrapper):
 def checked(env: gymnasium.Env) -> Checked:
     """An environment with its returns checked; one that has this already as it is."""
     return env if isinstance(env, Checked) else Checked(env, env.spec.id if env.spec else type(env.unwrapped).__name__)
+
+
+def _is_plain(array: Any, shape: tuple[int, ...] | None) -> bool:
+    """Whether it is what nearly all are, a finite float32 vector of this shape: a quick test in each step.
+
+    The sum of squares is infinite for large finite values too, which the slower test of all else then takes.
+    """
+    if type(array) is not _ARRAY or array.dtype is not _FLOAT32 or array.shape != shape:
+        return False
+    return isfinite(sum(array.tolist()) if array.size < 32 else np.vdot(array, array))
 
 
 def _is_of_boxes(space: Any) -> bool:

@@ -49,9 +49,8 @@ def init(algorithm: Algorithm, spec: Spec, demos: Sequence[Batch], seed: int | A
     learner = Learner(agent, reward, root, {})
     window = _zeros(spec, algorithm.agent.batch_size, max(algorithm.agent.n_step, algorithm.reward.span))
     expert = _zeros(spec, algorithm.reward.batch_size, algorithm.reward.span)
-    metrics = jax.eval_shape(functools.partial(_step, algorithm), learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[
-        1
-    ]
+    traced = functools.partial(_step, algorithm)
+    metrics = jax.eval_shape(traced, learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
     zeros = {name: jnp.zeros(()) for name in [*sorted(metrics.keys() - set(UNSAID)), "updates"]}
     return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(checks(metrics)))})
 

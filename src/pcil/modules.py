@@ -66,3 +66,16 @@ def load(option: str, spec: str, base: type, expected: str) -> Any:
         raise InputError(
             f"{option} {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like {expected}."
         ) from error
+
+
+def instance(option: str, kind: type) -> Any:
+    """An object of the class, created without arguments; `InputError` where its code raises."""
+    try:
+        return kind()
+    except InputError:
+        raise
+    except Exception as error:  # the class may be a user's own and may raise anything
+        raise InputError(
+            f"{option} {kind.__module__}:{kind.__qualname__} can't be created without arguments "
+            f"({type(error).__name__}: {error}); it must define every abstract method, and every argument needs a default."
+        ) from error

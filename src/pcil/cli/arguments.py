@@ -15,7 +15,11 @@ from pcil.modules import Trust
 
 if TYPE_CHECKING:
     from pcil.training.callbacks import Callback
-    from pcil.training.config import Run
+
+Execute = Callable[..., int]
+"""Trains a run: `(run, folder, callbacks) -> exit code`. Its types are not named, for `tyro` would resolve them here."""
+SEVERAL = ("callbacks",)
+"""Options of `pcil train` that take more than one value."""
 
 
 def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
@@ -43,7 +47,7 @@ def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
     return bound()
 
 
-def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"], int]) -> int:
+def train(argv: list[str], execute: Execute) -> int:
     """Call `execute` with the run, the folder and the callbacks that the arguments of `pcil train` give."""
     import tyro
 
@@ -89,7 +93,7 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
 
 
 def _train_again(
-    execute: Callable[["Run", Path, "Sequence[Callback]"], int],
+    execute: Execute,
     settings: str,
     out: Path,
     callbacks: tuple[str, ...] = (),
@@ -104,18 +108,12 @@ def _train_again(
         trust: Modules that the settings may name, whose code is then run, such as my.module.
     """
     from pcil import files, modules
-    from pcil.training.config import REGISTRIES, Run, part_of_run
+    from pcil.training import config
 
     source = "--settings" if settings.lstrip().startswith("{") else settings
     try:
         table = files.parse_json(settings.encode()) if source == "--settings" else files.read_json(Path(settings))
-        flat = files.flat(table.get("run", table))
-        classes = {}
-        for part in REGISTRIES:
-            if named := modules.of_class(flat[f"{part}.class"]):
-                modules.admit(source, named, trust)
-                classes[flat[f"{part}.class"]] = part_of_run(part, flat[f"{part}.class"])
-        run = Run.from_json(flat, classes)
+        run = config.run_of_file(source, table.get("run", table), trust)
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{source} holds no settings of a run ({error}); give the run.json of one.") from error
     modules.admit(source, modules.of_task(run.task, run.env_kwargs), trust)
@@ -128,7 +126,8 @@ def _callbacks(specs: Sequence[str]) -> "list[Callback]":
     from pcil.training.callbacks import Callback
 
     modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec)], None)
-    return [modules.load("--callbacks", spec, Callback, "my.module:MyLogger")() for spec in specs]
+    classes = [modules.load("--callbacks", spec, Callback, "my.module:MyLogger") for spec in specs]
+    return [modules.instance("--callbacks", kind) for kind in classes]
 
 
 def _renamed(word: str) -> str:
@@ -145,14 +144,13 @@ def _renamed(word: str) -> str:
 
 def peek(argv: list[str]) -> dict[str, str]:
     """The values of the options as they are given, before the method has decided which options there are."""
-    given, rest = {}, iter(argv)
+    given, rest, several = {}, iter(argv), False
     for word in rest:
-        if word.startswith("--") and "=" in word:
-            name, value = word[2:].split("=", 1)
-            given[name] = value
-        elif word.startswith("--"):
-            given[word[2:]] = next(rest, "")
-        elif not word.startswith("-"):
+        if word.startswith("--"):
+            name, equals, value = word[2:].partition("=")
+            given[name] = value if equals else next(rest, "")
+            several = name in SEVERAL and not equals
+        elif not word.startswith("-") and not several:
             given["task"] = word
     return given
 

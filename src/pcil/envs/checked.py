@@ -99,6 +99,10 @@ class Checked(gymnasium.Wrapper):
             terminated = self._flag(terminated, "termination")
         if type(truncated) is not bool:
             truncated = self._flag(truncated, "truncation")
+        if type(info) is not dict:
+            if not isinstance(info, Mapping | None):
+                raise self._refused(info, "as info", "a dict")
+            info = dict(info or {})
         return row, reward, terminated, truncated, info
 
     def close(self) -> None:
@@ -145,13 +149,13 @@ class Checked(gymnasium.Wrapper):
             for i, inner in enumerate(space.spaces):
                 yield from self._parts(inner, value[i], f"{path}[{i}]")
         else:
-            array = _numbers(value)
+            array = real_numbers(value)
             if array is None or array.shape != space.shape:
                 raise self._refused(value, f"as {path}", f"real numbers of shape {space.shape}, as its space says")
             yield path, array
 
     def _reward(self, reward: Any) -> float:
-        array = _numbers(reward)
+        array = real_numbers(reward)
         if array is None or array.size != 1:
             raise self._refused(reward, "as reward", "a number")
         number = float(array.item())
@@ -160,14 +164,14 @@ class Checked(gymnasium.Wrapper):
         return number
 
     def _flag(self, value: Any, what: str) -> bool:
-        array = _numbers(value)
+        array = real_numbers(value)
         if array is None or array.size != 1 or array.dtype.kind == "f" or array.item() not in (0, 1):
             raise self._refused(value, f"as {what}", "True or False")
         return bool(array.item())
 
     def checked_action(self, action: Any) -> np.ndarray:
         """An action for the next step; `InputError` if it is of another shape or no numbers, `RunError` if it is not finite."""
-        array = _numbers(action)
+        array = real_numbers(action)
         if array is None or array.shape != self._action_shape:
             raise InputError(
                 f"The action for {self._name!r} is {brief(action)}, {self._place(1)}; it must be real numbers of shape "
@@ -208,7 +212,7 @@ def _is_of_boxes(space: Any) -> bool:
     return isinstance(space, spaces.Box)
 
 
-def _numbers(value: Any) -> np.ndarray | None:
+def real_numbers(value: Any) -> np.ndarray | None:
     """An array of real numbers or bools; None for everything else, and where entries are masked."""
     try:
         array = np.asarray(value)

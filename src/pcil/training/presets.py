@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from pcil import modules
 from pcil.errors import InputError, brief
 from pcil.nets.noise import LinearSchedule
 from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed
@@ -214,7 +215,10 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     own, changes = METHOD_SETTINGS[method, preset], renamed(changes)
     settings: dict[str, Any] = {**PRESETS[preset](task), **(own(task) if callable(own) else own)}
     parts = {part: changes.pop(part, settings[part]) for part in REGISTRIES}
-    made = {part: part_of_run(part, named)() if isinstance(named, str) else named for part, named in parts.items()}
+    made = {
+        part: modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
+        for part, named in parts.items()
+    }
     kept = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)}
     plain = {name: kept.pop(name) for name in list(kept) if "." not in name}
     return changed(Run(task=task, method=method, preset=preset, **made, **plain), kept | changes)

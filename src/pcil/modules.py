@@ -19,14 +19,20 @@ Trust = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE ...")]
 _NAMED = re.compile(r"([^\W\d][\w.]*):[\w-]")
 
 
+def is_ours(module: str) -> bool:
+    """Whether a module belongs to this package, so that a file may name its classes without trust."""
+    return module.startswith(("pcil.agents.", "pcil.nets.", "pcil.rewards."))
+
+
 def of_task(task: str, env_kwargs: Any = None) -> list[str]:
     """The modules that Gymnasium imports for a task, and those that look like code in its environment's keyword arguments."""
     return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
 
 
 def of_class(spec: Any) -> list[str]:
-    """The module of a class that is named as `module:Class`; none of one that goes by its name in a registry."""
-    return [spec.partition(":")[0]] if isinstance(spec, str) and ":" in spec else []
+    """The module of a class that is named as `module:Class`, unless it is ours; none for a name in a registry."""
+    module, colon, _ = spec.partition(":") if isinstance(spec, str) else ("", "", "")
+    return [module] if colon and not is_ours(module) else []
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:

@@ -77,6 +77,10 @@ class Policy:
             kind: dict[str, Any] = {"layers": len(self.actor.head.weights)}
         else:
             named = f"{type(self.actor).__module__}:{type(self.actor).__qualname__}"
+            if not callable(getattr(self.actor, "from_arrays", None)):
+                raise InputError(
+                    f"The actor {named} can't be saved: it needs a class method from_arrays(arrays) to be loaded by."
+                )
             kind = {"class": named, "sizes": [self.spec.obs_dim, self.spec.action_dim]}
         text = json.dumps({"format": FORMAT, "task": self.task, **kind, "info": self.info}) + "\n"
         checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"  # one entry: of more the order is random
@@ -115,13 +119,13 @@ def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
     try:
         header = files.read_json(folder / "policy.json")
         arrays = _read(folder / "policy.safetensors")
-        own = header.get("class")
-        if own is not None:
-            modules.admit(f"The policy in {folder}", modules.of_class(own), trust)
-            kind = modules.load("The policy's class", own, object, "my.module:MyActor")
+        _check_header(header)
+        if "class" in header:
+            modules.admit(f"The policy in {folder}", modules.of_class(header["class"]), trust)
+            kind = modules.load("The policy's class", header["class"], object, "my.module:MyActor")
             obs_dim, action_dim = map(int, header["sizes"])
-            sizes = Spec(obs_dim, action_dim, header["info"].get("action_repeat", 1))
-            return Policy(kind.from_arrays(arrays), header["task"], header["info"], sizes)
+            sizes = Spec(obs_dim, action_dim, header.get("info", {}).get("action_repeat", 1))
+            return Policy(kind.from_arrays(arrays), header["task"], header.get("info", {}), sizes)
         actor = _build(header, arrays)
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, SafetensorError, OSError) as error:
         raise InputError(
@@ -158,10 +162,18 @@ def _read(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
-    """The actor from its arrays; every shape must follow from the one before."""
+def _check_header(header: dict[str, Any]) -> None:
+    """Raise an error where `policy.json` is not as `Policy.save` writes it."""
     if header["format"] != FORMAT:
         raise ValueError(f"format {header['format']!r} is not {FORMAT!r}")
+    if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
+        raise ValueError("its task is no name or its info no table")
+    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
+        raise ValueError("its env_kwargs are no table")
+
+
+def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
+    """The actor with these arrays; `ValueError` where the shapes of its layers do not fit each other."""
     for name, array in arrays.items():
         arrays[name] = array.astype(np.float32, copy=False)
         if array.dtype.kind != "f" or 0 in array.shape or not np.isfinite(arrays[name]).all():
@@ -175,10 +187,6 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
     if not layers or len(arrays) != 4 + len(scaling) + 2 * len(layers):
         raise ValueError("names and arrays do not fit")
-    if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
-        raise ValueError("its task is no name or its info no table")
-    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
-        raise ValueError("its env_kwargs are no table")
     if not (trunk.weight.ndim == 2 and all(bias.ndim == 1 for bias in biases)):
         raise ValueError("its weights are no matrices or its biases no vectors")
     width = trunk.weight.shape[1]

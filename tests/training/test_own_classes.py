@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import pcil
-from pcil import cli
+from pcil import cli, modules
 from pcil.errors import InputError, RunError
 from pcil.training.callbacks import Callback, Callbacks, History, TensorBoard
 from pcil.training.config import Run, run_of_file
@@ -78,6 +78,9 @@ class Picky(Callback):
 """
 
 
+MUTE = NETS.replace('    @classmethod\n    def from_arrays(cls, arrays):\n        return cls(arrays["weight"])\n', "")
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two modules of a user, and demonstrations."""
@@ -139,6 +142,32 @@ def test_a_file_that_names_our_own_classes_by_their_paths_needs_no_trust() -> No
     settings = run.to_json()
     settings["agent"]["class"] = "pcil.agents.bc:BC"
     assert run_of_file("old.json", settings, ()) == Run.from_json(run.to_json())
+
+
+def test_an_actor_that_could_not_be_loaded_again_is_refused_before_anything_is_learned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "mute_nets.py").write_text(MUTE)
+    (tmp_path / "mute_agent.py").write_text(AGENT.replace("own_nets", "mute_nets"))
+    argv = [word.replace("own_agent", "mute_agent") for word in words(tmp_path / "run")]
+    assert cli.main(argv) == 2
+    assert "needs a class method from_arrays" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "policy" / "policy.json").exists()
+
+
+@pytest.mark.parametrize("changes", [{"task": 5}, {"info": []}, {"info": {"env_kwargs": 3}}, {"format": "x"}, {"sizes": [2]}])
+def test_the_header_of_a_policy_of_ones_own_is_checked_like_any_other(changes: dict[str, Any], tmp_path: Path) -> None:
+    assert cli.main(words(tmp_path / "run")) == 0
+    path = tmp_path / "run" / "policy" / "policy.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(InputError, match="is damaged"):
+        pcil.load_policy(tmp_path / "run", ["own_nets"])
+
+
+def test_an_agent_of_the_package_may_have_an_actor_of_its_own_and_needs_no_trust() -> None:
+    assert modules.of_class("pcil.agents.linear:Linear") == []
+    assert modules.of_class("pcil_agents:Linear") == ["pcil_agents"]
 
 
 REFUSED = {

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec, registry
 from jaxtyping import Float
 
+from pcil import envs
 from pcil.errors import InputError
 from pcil.files import parse_json, read_json
 from pcil.types import Episode, Origin
@@ -176,7 +177,7 @@ def _env_spec(task: str, origin: Origin) -> EnvSpec | None:
         return None
     if origin.env_id == known.id:
         known = dataclasses.replace(known, kwargs=known.kwargs | (origin.kwargs or {}))
-    if known.namespace in ("dmc", "toy"):  # these are so by themselves
+    if known.namespace in envs.SUITES:  # flat and in [-1, 1] without wrappers
         return known
     flatten = gymnasium.wrappers.FlattenObservation.wrapper_spec()
     rescale = gymnasium.wrappers.RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0)

@@ -39,27 +39,30 @@ LONGEST_EPISODE = 100_000
 _GIVEN = ("object ", "function ")
 """How the names begin of environments that were given in Python: as they are, or by a function."""
 
-_TOYS = {
-    "toy/point_mass-v0": "PointMass",
-    "toy/reach-v0": "Reach",
-    "toy/probe_1-v0": "ConstantReward",
-    "toy/probe_2-v0": "ObservedReward",
-    "toy/probe_3-v0": "DelayedReward",
-    "toy/probe_4-v0": "ActionReward",
-    "toy/probe_5-v0": "ObservedActionReward",
+SUITES: dict[str, dict[str, tuple[str, dict[str, Any]]]] = {
+    "dmc": {task: ("pcil.envs.dmc:DMCEnv", {"task": task}) for task in TASKS},
+    "toy": {
+        "point_mass": ("pcil.envs.toy:PointMass", {}),
+        "reach": ("pcil.envs.toy:Reach", {}),
+        "probe_1": ("pcil.envs.toy:ConstantReward", {}),
+        "probe_2": ("pcil.envs.toy:ObservedReward", {}),
+        "probe_3": ("pcil.envs.toy:DelayedReward", {}),
+        "probe_4": ("pcil.envs.toy:ActionReward", {}),
+        "probe_5": ("pcil.envs.toy:ObservedActionReward", {}),
+    },
 }
+"""The environments of this package: entry point and keyword arguments of `<suite>/<name>-v0`, by suite and by name."""
 
 
 def register() -> None:
-    """Registers `dmc/<task>-v0` for the ten tasks and the toy environments with Gymnasium; again is harmless."""
-    for task in TASKS:
-        _register(dmc_id(task), "pcil.envs.dmc:DMCEnv", task=task)
-    for toy_id, name in _TOYS.items():
-        _register(toy_id, f"pcil.envs.toy:{name}")
+    """Register the environments of `SUITES` with Gymnasium; those that are registered already stay as they are."""
+    for suite, environments in SUITES.items():
+        for name, (entry_point, kwargs) in environments.items():
+            _register(f"{suite}/{name}-v0", entry_point, **kwargs)
 
 
-def _register(env_id: str, entry_point: str, **kwargs: str) -> None:
-    """Registers one environment so that `gymnasium.make` wraps nothing around it."""
+def _register(env_id: str, entry_point: str, **kwargs: Any) -> None:
+    """Register one environment so that `gymnasium.make` adds no wrappers."""
     if env_id not in gymnasium.registry:
         gymnasium.register(env_id, entry_point, kwargs=kwargs, disable_env_checker=True, order_enforce=False)
 
@@ -96,7 +99,7 @@ def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any
     if isinstance(env, Checked):
         return env
     registered = env.spec
-    own = registered is not None and registered.namespace in ("dmc", "toy")
+    own = registered is not None and registered.namespace in SUITES
     limited = own or (registered is not None and registered.max_episode_steps is not None)
     try:
         return Checked(_flat_actions(env, task_name(task)), task_name(task), None if limited else LONGEST_EPISODE)
@@ -128,7 +131,7 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
     register()
     arguments = json_object("env_kwargs", env_kwargs or {})
     env_id = _gymnasium_id(task)
-    if render_mode is not None and env_id in _TOYS:
+    if render_mode is not None and env_id.startswith("toy/"):
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
     if "task" in arguments and env_id.startswith("dmc/"):
         raise InputError(f"env_kwargs has the task {arguments['task']!r}; the task is {task!r}, and arguments can't change it.")
@@ -165,10 +168,9 @@ def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
 
 def spec(env: gymnasium.Env) -> Spec:
     """The sizes of a made environment, and how many control steps (frames) one of its steps takes."""
-    from pcil.envs.dmc import DMCEnv
-
     inner = env.unwrapped
-    action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
+    ours = any(kind.__module__.startswith("pcil.envs.") for kind in type(inner).__mro__)
+    action_repeat = getattr(inner, "action_repeat", 1) if ours else 1
     return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
 
 

@@ -139,10 +139,10 @@ class Run:
     def own_modules(self) -> tuple[str, ...]:
         """The modules of an agent and a reward that are none of ours, and that of such an agent's actor."""
         kinds = [type(self.agent), type(self.reward)]
-        if not kinds[0].__module__.startswith("pcil."):
+        if not modules.is_ours(kinds[0].__module__):
             spec = Spec(obs_dim=2, action_dim=1, action_repeat=1)  # the class of the actor depends on no size
             kinds.append(type(jax.eval_shape(lambda key: self.agent.actor(self.agent.init(spec, key=key)), jax.random.key(0))))
-        return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not kind.__module__.startswith("pcil.")))
+        return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not modules.is_ours(kind.__module__)))
 
     @property
     def needs_demos(self) -> bool:

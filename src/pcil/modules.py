@@ -1,4 +1,4 @@
-"""Code that a person brings as `module:Name`: a module that a file names is imported only where that person trusts it."""
+"""User code that is named as `module:Name`. A module that is named in a file is imported only if the user trusts it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import tyro
 from pcil.errors import InputError, brief
 
 Trust = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE ...")]
-"""The option that says which modules a file may name."""
+"""The option that lists the modules that a file may name."""
 _NAMED = re.compile(r"([^\W\d][\w.]*):[\w-]")
 
 
@@ -25,21 +25,21 @@ def is_ours(module: str) -> bool:
 
 
 def of_task(task: str, env_kwargs: Any = None) -> list[str]:
-    """The modules that Gymnasium imports for a task, and those that look like code in its environment's keyword arguments."""
+    """The modules that Gymnasium imports for a task, and those in keyword arguments that look like `module:Name`."""
     return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
 
 
 def of_class(spec: Any) -> list[str]:
-    """The module of a class that is named as `module:Class`, unless it is ours; none for a name in a registry."""
+    """The module of a class that is named as `module:Class`, unless it is part of this package; none for other names."""
     module, colon, _ = spec.partition(":") if isinstance(spec, str) else ("", "", "")
     return [module] if colon and not is_ours(module) else []
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:
-    """Let the modules that `source` names be imported, from the present folder too, which is searched last.
+    """Allow the modules that `source` names to be imported, also from the current folder, which is searched last.
 
-    `trust` are the modules that a file may name, each with all that is in it; None where a person typed the names. `InputError`
-    where another module is named.
+    `trust` are the modules that a file may name, including their submodules; None if the user typed the names. `InputError` if
+    another module is named.
     """
     for name in (names := list(names)):
         if trust is not None and not any(f"{name}.".startswith(f"{trusted}.") for trusted in trust):
@@ -47,7 +47,7 @@ def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> Non
                 f"{source} names code of the module {brief(name)}, and what a file names is not run unasked; read that code, "
                 f"and give --trust {name} if you trust it."
             )
-    with contextlib.suppress(OSError):  # the present folder may be gone
+    with contextlib.suppress(OSError):  # the current folder may have been deleted
         if names and (here := os.getcwd()) not in sys.path:
             sys.path.append(here)
 
@@ -61,14 +61,14 @@ def _of_values(values: Any) -> list[str]:
 
 
 def load(option: str, spec: str, base: type, expected: str) -> Any:
-    """The subclass of `base` that `module:Class` names; `InputError` says that it must look like what is `expected`."""
+    """Import the subclass of `base` that `spec`, `module:Class`, names; the `InputError` tells what was `expected`."""
     module, _, name = spec.partition(":")
     try:
         kind = getattr(importlib.import_module(module), name)
         if not (isinstance(kind, type) and issubclass(kind, base)):
             raise TypeError(f"{name} is no subclass of pcil.{base.__name__}")
         return kind
-    except Exception as error:  # the module is a person's own and may raise anything
+    except Exception as error:  # the module is a user's own and may raise anything
         raise InputError(
             f"{option} {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like {expected}."
         ) from error

@@ -1,4 +1,4 @@
-"""Environments by name: `make("walker_walk")` or any Gymnasium id, always with flat float32 boxes."""
+"""Environments by name: `make("walker_walk")` or any Gymnasium id, always with flat float32 Boxes as spaces."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ TASKS = (
 """The ten tasks of the paper (Appendix A), all from DeepMind Control."""
 
 LONGEST_EPISODE = 100_000
-"""Steps after which an environment without a time limit is taken to have no end."""
+"""The number of steps after which an episode without a time limit is considered endless."""
 
 _GIVEN = ("object ", "function ")
-"""How the names begin of environments that were given in Python: as they are, or by a function."""
+"""The prefixes of the names of environments that were passed from Python, as an object or as a function."""
 
 SUITES: dict[str, dict[str, tuple[str, dict[str, Any]]]] = {
     "dmc": {task: ("pcil.envs.dmc:DMCEnv", {"task": task}) for task in TASKS},
@@ -73,9 +73,9 @@ def dmc_id(task: str) -> str:
 
 
 def task_name(task: Any) -> str:
-    """The short name under which results are kept: "walker_walk" for "dmc/walker_walk-v0", other ids as they are.
+    """The short name of a task in results: "walker_walk" for "dmc/walker_walk-v0"; other ids are returned unchanged.
 
-    Of a function that makes an environment, or of an environment, it says which it is; `make` takes no such name.
+    For an environment, or a function that creates one, the name says so; `make` does not accept such a name.
     """
     if isinstance(task, str):
         return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
@@ -88,12 +88,12 @@ def task_name(task: Any) -> str:
 
 
 def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Checked:
-    """The environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
+    """Create the environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
 
-    `task` is a task of DeepMind Control's suite ("walker_walk" or "dmc/walker_walk-v0"), one of our toys
-    ("toy/point_mass-v0"), any Gymnasium id, a function that makes an environment, or an environment. `env_kwargs` are keyword
-    arguments of the environment, given to `gymnasium.make` or to the function. Observations are Boxes, or Dicts and Tuples of
-    Boxes: these are flattened, actions are rescaled, and all that comes back is checked (`pcil.envs.checked:Checked`).
+    `task` is a task of the DeepMind Control suite ("walker_walk" or "dmc/walker_walk-v0"), a toy ("toy/point_mass-v0"), any
+    Gymnasium id, a function that creates an environment, or an environment. `env_kwargs` are passed to `gymnasium.make` or to
+    the function. The environment's observations may be Boxes, or Dicts and Tuples of Boxes. They are flattened, actions are
+    rescaled, and all return values are checked (`pcil.envs.checked:Checked`).
     """
     env = task if isinstance(task, gymnasium.Env) else _made(task, render_mode, env_kwargs)
     if isinstance(env, Checked):
@@ -113,7 +113,7 @@ def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any
 
 @contextlib.contextmanager
 def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Iterator[Checked]:
-    """The environment that `make` gives, closed at the end; one that was given as an object is its owner's to close."""
+    """`make` as a context manager that closes the environment, unless it was passed as an object: then its owner closes it."""
     env = make(task, render_mode, env_kwargs=env_kwargs)
     try:
         yield env
@@ -123,7 +123,7 @@ def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, A
 
 
 def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None) -> gymnasium.Env:
-    """The environment as Gymnasium or a function makes it."""
+    """The environment as Gymnasium or the user's function creates it."""
     if not isinstance(task, str):
         return _returned(task, env_kwargs or {})
     if task.startswith(_GIVEN):
@@ -147,13 +147,13 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
         if env_id.rpartition(":")[2] not in gymnasium.registry:
             _refuse_name(task, error)
         raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
-    except Exception as error:  # the environment may be a person's own and may raise anything
+    except Exception as error:  # the environment may be a user's own and may raise anything
         given = f" with {json.dumps(env_kwargs)}" if env_kwargs else ""
         raise InputError(f"The environment {task!r} can't be made{given} ({type(error).__name__}: {error}).") from error
 
 
 def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
-    """The environment that a function makes."""
+    """The environment that the user's function creates."""
     name = task_name(function)
     try:
         env = function(**env_kwargs)
@@ -167,7 +167,7 @@ def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
 
 
 def spec(env: gymnasium.Env) -> Spec:
-    """The sizes of a made environment, and how many control steps (frames) one of its steps takes."""
+    """The sizes of an environment that `make` has created, and its number of control steps (frames) per step."""
     inner = env.unwrapped
     ours = any(kind.__module__.startswith("pcil.envs.") for kind in type(inner).__mro__)
     action_repeat = getattr(inner, "action_repeat", 1) if ours else 1
@@ -175,12 +175,12 @@ def spec(env: gymnasium.Env) -> Spec:
 
 
 def ends_early(env: gymnasium.Env) -> bool:
-    """Whether an episode may terminate: it is taken to, unless the environment has an attribute `ends_early` that is False."""
+    """Whether an episode may terminate: True unless the environment has an attribute `ends_early` that is False."""
     return bool(getattr(env.unwrapped, "ends_early", True))
 
 
 def origin(env: gymnasium.Env) -> Origin:
-    """What demonstrations recorded in `env` are to know of it."""
+    """The description of `env` that is stored with demonstrations recorded in it."""
     inner, outer = env.unwrapped, env
     while isinstance(outer, gymnasium.Wrapper) and not isinstance(outer, _RescaleAction):
         outer = outer.env
@@ -196,7 +196,7 @@ def origin(env: gymnasium.Env) -> Origin:
 
 
 def known_arguments(kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Those of an environment's keyword arguments that JSON can hold, without the way it is rendered."""
+    """The keyword arguments that JSON can represent, without `render_mode`."""
     known = {}
     for name, value in kwargs.items():
         with contextlib.suppress(InputError):
@@ -205,11 +205,11 @@ def known_arguments(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 class _RescaleAction(wrappers.RescaleAction):
-    """Ours, in contrast to one that the environment is registered with."""
+    """A class of its own, to tell our wrapper from one that the environment was registered with."""
 
 
 def _gymnasium_id(task: str) -> str:
-    """The registered id for a name; registers a task of the suite that is not among the ten on demand."""
+    """The registered id for a name. Tasks of the DeepMind Control suite beyond the ten are registered on demand."""
     name = task_name(task)
     if dmc_id(name) in gymnasium.registry:
         return dmc_id(name)
@@ -220,7 +220,7 @@ def _gymnasium_id(task: str) -> str:
 
 
 def _suite_tasks() -> list[str]:
-    """Every task of DeepMind Control's suite by name, none where it is not installed; the import takes half a second."""
+    """The names of all tasks of the DeepMind Control suite; none if it is not installed. The import takes half a second."""
     from pcil.envs.dmc import import_suite
 
     try:

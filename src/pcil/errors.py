@@ -1,4 +1,4 @@
-"""The errors that are shown as one sentence, and the checks of settings that raise them."""
+"""The exceptions that the command line prints as one sentence, and the checks of settings that raise them."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ NO_ROOM = {
     errno.EDQUOT: "the quota on the disk is used up",
     errno.EFBIG: "a file would be larger than the system allows (ulimit -f)",
 }
-"""What the system says where nothing more can be written."""
+"""The system errors that mean that nothing more can be written."""
 WHOLE = 2**53
-"""The largest whole number of a setting; up to it a float holds every one."""
+"""The largest integer of a setting; a float can represent every integer up to this."""
 
 
 class InputError(Exception):
-    """Something that a person gave is wrong. The command line prints it as one sentence and exits with `exit_code`."""
+    """The user's input is invalid. The command line prints the message as one sentence and exits with `exit_code`."""
 
     exit_code = 2
 
 
 class RunError(InputError):
-    """A run failed while it ran: its environment raised or returned a value that is not finite, or the training diverged.
+    """A run failed: its environment raised an exception or returned a value that is not finite, or training diverged.
 
-    `__cause__` is what the environment raised.
+    `__cause__` is the exception of the environment, if there was one.
     """
 
     exit_code = 1
 
 
 def brief(value: Any) -> str:
-    """A value in a few words: an array by its shape and dtype, plain values shortened, others by their class."""
+    """A short description of a value: shape and dtype of an array, a plain value (shortened), or the class of an object."""
     shape = getattr(value, "shape", None)
     if isinstance(shape, tuple) and not isinstance(value, numbers.Number):
         return f"an array of shape {shape} and dtype {getattr(value, 'dtype', 'unknown')}"
@@ -49,22 +49,22 @@ def brief(value: Any) -> str:
 
 
 def shown(text: str, longest: int = 1500) -> str:
-    """Text for a terminal on one line: what is no printable character is escaped, and the middle of a long one left out."""
+    """Text for one line of a terminal: characters that are not printable are escaped, and long text is shortened."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     half = longest // 2
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
 
 
-def said(error: Exception) -> tuple[str, int] | None:
-    """The sentence that a command ends with and its exit code; None of an error that only a mistake of ours can raise."""
+def as_message(error: Exception) -> tuple[str, int] | None:
+    """The message and the exit code of a command that ends with this exception; None if it can only be a bug of ours."""
     if isinstance(error, InputError):
-        sentence = " ".join(str(error).split())  # what a library said may have line breaks
+        sentence = " ".join(str(error).split())  # messages of libraries may have line breaks
         return shown(sentence.removesuffix(".")), error.exit_code
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EAGAIN) or isinstance(error, MemoryError):
         scarce = True
-    else:  # what JAX and Python say
-        scarce = any(words in str(error) for words in ("RESOURCE_EXHAUSTED", "bad_alloc", "can't start new thread"))
+    else:  # messages of JAX and Python
+        scarce = any(text in str(error) for text in ("RESOURCE_EXHAUSTED", "bad_alloc", "can't start new thread"))
     if scarce:
         reason = shown(" ".join(str(error).split()) or "no memory is left", 300)
         return f"The system refuses what this needs ({reason}); raise the limits that ulimit -a shows, or ask for less", 1
@@ -74,17 +74,17 @@ def said(error: Exception) -> tuple[str, int] | None:
 
 
 def check_ranges(settings: Any, **ranges: tuple[float | int, float | int]) -> None:
-    """Each named field must be a number from the first to the second of its range, or `InputError` says which is not."""
+    """Check that each named field is within its range (low, high); `InputError` names the first that is not."""
     for name, (low, high) in ranges.items():
         value = getattr(settings, name)
         high = WHOLE if isinstance(value, int) and math.isinf(high) and value > WHOLE else high
-        if not low <= value <= high:  # NaN is in no range
+        if not low <= value <= high:  # also refuses NaN
             limits = f"at least {low}" if math.isinf(high) else f"from {low} to {high}"
             raise InputError(f"{type(settings).__name__}.{name} is {value}; it must be {limits}.")
 
 
 def check_kinds(settings: Any) -> None:
-    """Each field must be what its annotation says: one of some words, a number, text, a class; `InputError` if it is not."""
+    """Check that each field has the type of its annotation: a Literal, a number, text or a class; else `InputError`."""
     hints = typing.get_type_hints(type(settings))
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
@@ -93,7 +93,7 @@ def check_kinds(settings: Any) -> None:
 
 
 def json_object(name: str, value: Any) -> dict[str, Any]:
-    """`value`, a dict or the text of a JSON object, as JSON gives it back: tuples become lists. Else `InputError`."""
+    """`value`, a dict or JSON text, after a round trip through JSON (tuples become lists); `InputError` if it is no object."""
     try:
         value = json.loads(value) if isinstance(value, str) else value
         if isinstance(value, dict) and all(isinstance(key, str) for key in value):
@@ -106,7 +106,7 @@ def json_object(name: str, value: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value is of a kind; of an annotation that says more than is known here, every value is."""
+    """Whether a value matches an annotation; annotations that are not known here match every value."""
     if typing.get_origin(hint) is typing.Literal:
         return isinstance(value, str) and value in typing.get_args(hint)
     if isinstance(hint, types.UnionType):
@@ -121,5 +121,5 @@ def _described(hint: Any) -> str:
         return f"one of {', '.join(map(repr, typing.get_args(hint)))}"
     if isinstance(hint, types.UnionType):
         return " or ".join(map(_described, typing.get_args(hint)))
-    words = {int: "a whole number", float: "a number", str: "text", bool: "True or False", types.NoneType: "None"}
-    return words.get(hint) or f"of class {hint.__name__}"
+    names = {int: "a whole number", float: "a number", str: "text", bool: "True or False", types.NoneType: "None"}
+    return names.get(hint) or f"of class {hint.__name__}"

@@ -1,4 +1,4 @@
-"""Files as they may lie in a folder: locks that follow no link and empty nothing, small text and JSON read within limits."""
+"""Files that may be damaged or hostile: locks that follow no links, and text, JSON and TOML that are read within limits."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from typing import Any, BinaryIO
 from pcil.errors import NO_ROOM, InputError
 
 LARGEST = 16 * 2**20
-"""Bytes of a file that is read whole."""
+"""The largest file in bytes that is read into memory."""
 DIGITS = 300
-"""Of a whole number in JSON; a float holds no more."""
+"""The largest number of digits of an integer in JSON, about that of a float."""
 DEPTH = 100
-"""Of tables and lists within each other: what is deeper could be read and then not be shown."""
+"""The deepest nesting of tables and lists; deeper ones could be parsed but not printed."""
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[bool]:
-    """Hold the lock of a file, which is made if need be; False where another process holds it.
+    """Hold a lock on a file, which is created if necessary. Yields False if another process holds the lock.
 
-    The lock ends with the process, however that ends, and the file stays. `InputError` with the reason where the system
-    refuses the lock, or where the file is a link.
+    The lock is released when the process ends, even if it is killed; the file stays. `InputError` if the system refuses the
+    lock, or if the file is a link.
     """
     import filelock
 
-    lock = filelock.FileLock(path, fallback_to_soft=False)  # soft locks outlive a killed process
+    lock = filelock.FileLock(path, fallback_to_soft=False)  # soft locks would remain after a process was killed
     try:
         if path.is_symlink():
             raise OSError("it is a link")
@@ -53,7 +53,7 @@ def locked(path: Path) -> Iterator[bool]:
 
 
 def expanded(path: Path) -> Path:
-    """The path with `~` as the user's home; `InputError` where nobody has that name."""
+    """The path with `~` expanded to the home directory; `InputError` if that can't be determined."""
     try:
         return path.expanduser()
     except RuntimeError as error:
@@ -61,9 +61,11 @@ def expanded(path: Path) -> Path:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """A regular file, open to read from; `ValueError` where it is a pipe or a device, `OSError` as ever."""
-    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)  # a pipe nobody writes to must not block
-    file = open(os.open(path, flags), "rb")  # noqa: SIM115 - it is the caller's to close
+    """Open a regular file for reading; `ValueError` if it is a pipe or a device, `OSError` as usual."""
+    flags = (
+        os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    )  # opening a pipe without a writer must not block
+    file = open(os.open(path, flags), "rb")  # noqa: SIM115 - the caller closes it
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise ValueError("it is no regular file")
@@ -71,7 +73,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_text(path: Path, limit: int = LARGEST) -> str:
-    """The text of a regular file; `ValueError` where it is a pipe, a device or larger than so many bytes, `OSError` as ever."""
+    """The text of a regular file; `ValueError` if it is a pipe, a device or has more than `limit` bytes, `OSError` as usual."""
     with open_regular(path) as file:
         content = file.read(limit + 1)
     if len(content) > limit:
@@ -80,7 +82,7 @@ def read_text(path: Path, limit: int = LARGEST) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """The whole file or nothing, after a power cut too."""
+    """Write a file atomically: after a crash or a power failure it has either its old or its new content."""
     partial = path.with_suffix(path.suffix + ".tmp")
     with partial.open("w") as file:
         file.write(text)
@@ -91,7 +93,7 @@ def write_text(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def room_for(what: str) -> Iterator[None]:
-    """Turn what a full disk or memory raises into an `InputError` that begins with the name of what did not fit."""
+    """Convert exceptions about a full disk or full memory to an `InputError` that begins with `what`."""
     try:
         yield
     except MemoryError as error:
@@ -105,7 +107,7 @@ def room_for(what: str) -> Iterator[None]:
 
 
 def reserve(folder: Path, size: int) -> None:
-    """Raise `OSError` where a folder has no room for so many bytes, for libraries that die where a write fails."""
+    """Raise `OSError` if the folder's disk has no room for `size` bytes; for libraries that crash if a write fails."""
     with tempfile.TemporaryFile(dir=folder) as file:
         while size > 0:
             size -= file.write(bytes(min(size, 2**20)))
@@ -113,7 +115,7 @@ def reserve(folder: Path, size: int) -> None:
 
 
 def save_arrays(path: Path, arrays: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
-    """Write a safetensors file; `OSError` where the disk does not take it."""
+    """Write a safetensors file; `OSError` if that fails."""
     import numpy as np
     from safetensors import SafetensorError
     from safetensors.numpy import save_file
@@ -127,8 +129,8 @@ def save_arrays(path: Path, arrays: dict[str, Any], metadata: dict[str, str] | N
 
 
 def sync(path: Path) -> None:
-    """Return once the disk holds a file, or the names in a folder, where the system can say so of a folder."""
-    with contextlib.suppress(PermissionError):  # Windows opens no folder
+    """Flush a file or a folder to the disk, where the system supports this."""
+    with contextlib.suppress(PermissionError):  # Windows can't open folders
         descriptor = os.open(path, os.O_RDONLY)
         try:
             os.fsync(descriptor)
@@ -137,23 +139,23 @@ def sync(path: Path) -> None:
 
 
 def read_json(path: Path, limit: int = LARGEST) -> Any:
-    """What a JSON file holds; `ValueError` or `OSError` where it can't be read."""
+    """The content of a JSON file; `ValueError` or `OSError` if it can't be read."""
     return parse_json(read_text(path, limit))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What JSON text says; `ValueError` too where it is nested too deeply, or holds a whole number that no float holds."""
+    """Parse JSON; `ValueError` also if it is nested too deeply or has an integer with too many digits."""
     return _shallow(lambda: json.loads(text, parse_int=_whole))
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """What a TOML file holds; `ValueError` or `OSError` where it can't be read."""
+    """The content of a TOML file; `ValueError` or `OSError` if it can't be read."""
     text = read_text(path)
     return _shallow(lambda: tomllib.loads(text))
 
 
 def _shallow(parse: Callable[[], Any]) -> Any:
-    """What is parsed, if it is nested no deeper than `DEPTH`, or else `ValueError`."""
+    """The parsed value; `ValueError` if it is nested deeper than `DEPTH`."""
 
     def check(value: Any, left: int) -> None:
         if left < 0:
@@ -176,7 +178,7 @@ def _whole(digits: str) -> int:
 
 
 def flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """The values of nested tables by their dotted names; an environment's keyword arguments are one value."""
+    """Flatten nested tables to dotted names; `env_kwargs` stays one value."""
     values: dict[str, Any] = {}
     for name, value in table.items():
         nested = isinstance(value, dict) and name.replace("-", "_") != "env_kwargs"

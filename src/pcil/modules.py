@@ -1,4 +1,4 @@
-"""Code that a person brings as `module:Name`: a module that a file names is imported only where that person trusts it."""
+"""User code that is named as `module:Name`. A module that is named in a file is imported only if the user trusts it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -15,25 +15,31 @@ import tyro
 from pcil.errors import InputError, brief
 
 Trust = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE ...")]
-"""The option that says which modules a file may name."""
+"""The option that lists the modules that a file may name."""
 _NAMED = re.compile(r"([^\W\d][\w.]*):[\w-]")
 
 
+def is_ours(module: str) -> bool:
+    """Whether a module belongs to this package, so that a file may name its classes without trust."""
+    return module.startswith(("pcil.agents.", "pcil.nets.", "pcil.rewards."))
+
+
 def of_task(task: str, env_kwargs: Any = None) -> list[str]:
-    """The modules that Gymnasium imports for a task, and those that look like code in its environment's keyword arguments."""
+    """The modules that Gymnasium imports for a task, and those in keyword arguments that look like `module:Name`."""
     return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
 
 
 def of_class(spec: Any) -> list[str]:
-    """The module of a class that is named as `module:Class`; none of one that goes by its name in a registry."""
-    return [spec.partition(":")[0]] if isinstance(spec, str) and ":" in spec else []
+    """The module of a class that is named as `module:Class`, unless it is part of this package; none for other names."""
+    module, colon, _ = spec.partition(":") if isinstance(spec, str) else ("", "", "")
+    return [module] if colon and not is_ours(module) else []
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:
-    """Let the modules that `source` names be imported, from the present folder too, which is searched last.
+    """Allow the modules that `source` names to be imported, also from the current folder, which is searched last.
 
-    `trust` are the modules that a file may name, each with all that is in it; None where a person typed the names. `InputError`
-    where another module is named.
+    `trust` are the modules that a file may name, including their submodules; None if the user typed the names. `InputError` if
+    another module is named.
     """
     for name in (names := list(names)):
         if trust is not None and not any(f"{name}.".startswith(f"{trusted}.") for trusted in trust):
@@ -41,7 +47,7 @@ def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> Non
                 f"{source} names code of the module {brief(name)}, and what a file names is not run unasked; read that code, "
                 f"and give --trust {name} if you trust it."
             )
-    with contextlib.suppress(OSError):  # the present folder may be gone
+    with contextlib.suppress(OSError):  # the current folder may have been deleted
         if names and (here := os.getcwd()) not in sys.path:
             sys.path.append(here)
 
@@ -55,27 +61,27 @@ def _of_values(values: Any) -> list[str]:
 
 
 def load(option: str, spec: str, base: type, expected: str) -> Any:
-    """The subclass of `base` that `module:Class` names; `InputError` says that it must look like what is `expected`."""
+    """Import the subclass of `base` that `spec`, `module:Class`, names; the `InputError` tells what was `expected`."""
     module, _, name = spec.partition(":")
-    with _refusing(option, spec, expected):
+    try:
         kind = getattr(importlib.import_module(module), name)
         if not (isinstance(kind, type) and issubclass(kind, base)):
             raise TypeError(f"{name} is no subclass of pcil.{base.__name__}")
         return kind
-
-
-def made(option: str, spec: str, base: type, expected: str) -> Any:
-    """An instance of that class, made without arguments."""
-    kind = load(option, spec, base, expected)
-    with _refusing(option, spec, expected):
-        return kind()
-
-
-@contextlib.contextmanager
-def _refusing(option: str, spec: str, expected: str) -> Iterator[None]:
-    try:
-        yield
-    except Exception as error:  # the module is a person's own and may raise anything
+    except Exception as error:  # the module is a user's own and may raise anything
         raise InputError(
             f"{option} {spec!r} can't be loaded ({type(error).__name__}: {error}); it must look like {expected}."
+        ) from error
+
+
+def instance(option: str, kind: type) -> Any:
+    """An object of the class, created without arguments; `InputError` where its code raises."""
+    try:
+        return kind()
+    except InputError:
+        raise
+    except Exception as error:  # the class may be a user's own and may raise anything
+        raise InputError(
+            f"{option} {kind.__module__}:{kind.__qualname__} can't be created without arguments "
+            f"({type(error).__name__}: {error}); it must define every abstract method, and every argument needs a default."
         ) from error

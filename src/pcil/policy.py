@@ -1,4 +1,4 @@
-"""A trained policy on its own: a NumPy function of the observation, saved as safetensors and JSON (no code in the files)."""
+"""A trained policy: a NumPy function of the observation, saved as safetensors and JSON (the files contain no code)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"
 LARGEST = 2**30
-"""Bytes of the arrays of a policy."""
+"""The largest `policy.safetensors` in bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,13 +30,13 @@ class Policy:
     actor: Any
     task: str
     info: dict[str, Any] = field(default_factory=dict)
-    """Where it comes from: method, frames, seed, settings, commit."""
+    """How it was trained: method, preset, seed, frames, mean return."""
     sizes: Spec | None = None
-    """Those of observation and action, which an actor of ours has itself."""
+    """The sizes of observation and action, for actors other than `pcil.nets.networks:Actor`."""
 
     @property
     def spec(self) -> Spec:
-        """Sizes of observation and action."""
+        """The sizes of observation and action."""
         if not isinstance(self.actor, Actor):
             assert self.sizes is not None
             return self.sizes
@@ -45,7 +45,7 @@ class Policy:
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of the environment that it was trained in."""
+        """The keyword arguments of the environment in which it was trained."""
         return self.info.get("env_kwargs", {})
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
@@ -55,31 +55,38 @@ class Policy:
                 f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers; "
                 f"got an array of shape {obs.shape}."
             )
-        with np.errstate(all="ignore"):  # an action that is not finite is refused where it is used
+        with np.errstate(all="ignore"):  # actions that are not finite are refused by the environment
             return self.actor(obs, np)
 
     def check_fits(self, env: Any) -> None:
-        """Raise `InputError` where a made environment has observations or actions of other sizes than the policy."""
+        """Raise `InputError` if the environment has other sizes of observations or actions than the policy."""
         obs, action = env.observation_space.shape, env.action_space.shape
         if (obs, action) != ((self.spec.obs_dim,), (self.spec.action_dim,)):
             raise InputError(
                 f"The policy for {self.task} takes observations of {self.spec.obs_dim} numbers and gives actions of "
-                f"{self.spec.action_dim}, but in its environment as it is made here they have shapes {obs} and {action}; give "
+                f"{self.spec.action_dim}, but in the environment created here they have shapes {obs} and {action}; give "
                 "--env-kwargs and the version of the environment that it was trained in."
             )
 
     def save(self, folder: Path) -> None:
-        """Write `policy.safetensors`, which holds its own checksum and that of `policy.json`, and `policy.json` into `folder`,
-        each by a rename, so neither is ever half written."""
+        """Write `policy.json` and `policy.safetensors` to `folder`, each atomically.
+
+        `policy.safetensors` has checksums of its own arrays and of `policy.json`.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         arrays = _named(self.actor)
         if isinstance(self.actor, Actor):
             kind: dict[str, Any] = {"layers": len(self.actor.head.weights)}
         else:
             named = f"{type(self.actor).__module__}:{type(self.actor).__qualname__}"
+            if not callable(getattr(self.actor, "from_arrays", None)):
+                raise InputError(
+                    f"The actor {named} can't be saved: it needs a class method from_arrays(arrays) to be loaded by."
+                )
             kind = {"class": named, "sizes": [self.spec.obs_dim, self.spec.action_dim]}
         text = json.dumps({"format": FORMAT, "task": self.task, **kind, "info": self.info}) + "\n"
-        checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"  # one entry: of more the order is random
+        # A single entry, since safetensors writes several ones in random order.
+        checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"
         files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": checksums})
         (folder / "policy.json.tmp").write_text(text)
         for name in ("policy.safetensors", "policy.json"):
@@ -87,22 +94,22 @@ class Policy:
 
 
 def as_saved(folder: Path) -> bool:
-    """Whether the `policy.json` of a folder is the one that was saved with its arrays; True of older ones, which don't say.
+    """Whether `policy.json` is unchanged since it was saved with its arrays; True for older policies without this checksum.
 
-    One that was edited since may be loaded all the same.
+    A policy with an edited `policy.json` can still be loaded.
     """
     from safetensors import safe_open
 
     with safe_open(folder / "policy.safetensors", "np") as file:
-        _, _, told = (file.metadata() or {}).get("sha256", "").partition(" ")
-    return told in ("", hashlib.sha256((folder / "policy.json").read_bytes()).hexdigest())
+        _, _, expected = (file.metadata() or {}).get("sha256", "").partition(" ")
+    return expected in ("", hashlib.sha256((folder / "policy.json").read_bytes()).hexdigest())
 
 
 def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
     """The policy of a run folder, or of a folder that holds `policy.safetensors` and `policy.json`.
 
-    `trust` are the modules that it may name for an actor that is none of ours. Raises `InputError` where there is none or where
-    the files are damaged.
+    `trust` are the modules that it may name for an actor that is not part of this package. `InputError` if there is no policy
+    or if its files are damaged.
     """
     from safetensors import SafetensorError
 
@@ -115,13 +122,13 @@ def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
     try:
         header = files.read_json(folder / "policy.json")
         arrays = _read(folder / "policy.safetensors")
-        own = header.get("class")
-        if own is not None:
-            modules.admit(f"The policy in {folder}", modules.of_class(own), trust)
-            kind = modules.load("The policy's class", own, object, "my.module:MyActor")
+        _check_header(header)
+        if "class" in header:
+            modules.admit(f"The policy in {folder}", modules.of_class(header["class"]), trust)
+            kind = modules.load("The policy's class", header["class"], object, "my.module:MyActor")
             obs_dim, action_dim = map(int, header["sizes"])
-            sizes = Spec(obs_dim, action_dim, header["info"].get("action_repeat", 1))
-            return Policy(kind.from_arrays(arrays), header["task"], header["info"], sizes)
+            sizes = Spec(obs_dim, action_dim, header.get("info", {}).get("action_repeat", 1))
+            return Policy(kind.from_arrays(arrays), header["task"], header.get("info", {}), sizes)
         actor = _build(header, arrays)
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, SafetensorError, OSError) as error:
         raise InputError(
@@ -131,13 +138,13 @@ def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
 
 
 def _named(actor: Any) -> dict[str, np.ndarray]:
-    """Arrays by their path in the tree, such as `head.weights.0`."""
+    """The actor's arrays by their path in the pytree, such as `head.weights.0`."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(actor, eqx.is_array))
     return {jax.tree_util.keystr(path, simple=True, separator="."): np.asarray(leaf) for path, leaf in leaves}
 
 
 def _digest(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 of names, shapes and values."""
+    """The SHA-256 of names, shapes and values."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.shape} ".encode() + array.astype("<f4").tobytes())
@@ -145,23 +152,31 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file; `ValueError` where they do not have the checksum that it holds, if it holds one."""
+    """The arrays of a file; `ValueError` if they do not match the checksum in the file, if there is one."""
     from safetensors import safe_open
 
     if path.stat().st_size > LARGEST:
         raise ValueError(f"{path.name} is larger than {LARGEST:,} bytes")
     with safe_open(path, "np") as file:
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
-        told = (file.metadata() or {}).get("sha256", "").partition(" ")[0]
-    if told not in ("", _digest(arrays)):
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        expected = (file.metadata() or {}).get("sha256", "").partition(" ")[0]
+    if expected not in ("", _digest(arrays)):
         raise ValueError("its values do not have their checksum")
     return arrays
 
 
-def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
-    """The actor from its arrays; every shape must follow from the one before."""
+def _check_header(header: dict[str, Any]) -> None:
+    """Raise `ValueError` or `LookupError` if the content of `policy.json` is invalid."""
     if header["format"] != FORMAT:
         raise ValueError(f"format {header['format']!r} is not {FORMAT!r}")
+    if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
+        raise ValueError("its task is no name or its info no table")
+    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
+        raise ValueError("its env_kwargs are no table")
+
+
+def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
+    """The actor with these arrays; `ValueError` if they are not finite or if their shapes are inconsistent."""
     for name, array in arrays.items():
         arrays[name] = array.astype(np.float32, copy=False)
         if array.dtype.kind != "f" or 0 in array.shape or not np.isfinite(arrays[name]).all():
@@ -175,10 +190,6 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
     biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
     if not layers or len(arrays) != 4 + len(scaling) + 2 * len(layers):
         raise ValueError("names and arrays do not fit")
-    if not (isinstance(header["task"], str) and header["task"] and isinstance(header.get("info", {}), dict)):
-        raise ValueError("its task is no name or its info no table")
-    if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
-        raise ValueError("its env_kwargs are no table")
     if not (trunk.weight.ndim == 2 and all(bias.ndim == 1 for bias in biases)):
         raise ValueError("its weights are no matrices or its biases no vectors")
     width = trunk.weight.shape[1]

@@ -1,6 +1,6 @@
-"""All randomness is a function of `(seed, stream, counter)`, so no generator state is ever saved.
+"""All randomness is a function of `(seed, stream, counter)`, so no generator state needs to be saved.
 
-A new consumer takes a new stream and shifts no other; a resumed run continues with the counters it had reached.
+A new consumer gets a new stream, which changes no other one. A resumed run continues with its saved counters.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Stream(enum.IntEnum):
-    """Who draws. The numbers are part of every result: add new ones at the end, never renumber."""
+    """The consumers of random numbers. Results depend on these integers: add new ones at the end, and never renumber."""
 
     INIT_AGENT = 0
     INIT_REWARD = 1
@@ -21,7 +21,7 @@ class Stream(enum.IntEnum):
     ACT = 3
     """Exploration; the counter is the episode."""
     SAMPLE = 4
-    """Draws from the replay and from the demonstrations; the counter is the episode."""
+    """Samples from the replay and from the demonstrations; the counter is the episode."""
     UPDATE = 5
     """Inside the compiled step; the counter is the update."""
     LABEL = 6
@@ -33,17 +33,17 @@ class Stream(enum.IntEnum):
 
 
 def key(root: Any, stream: Stream, counter: Any) -> Any:
-    """The JAX key of one draw, from the run's root key; `counter` may be traced."""
-    import jax  # here: what reads demonstrations and draws figures needs no JAX
+    """A JAX key, derived from the run's root key; `counter` may be traced."""
+    import jax  # imported here: reading demonstrations and drawing figures need no JAX
 
     return jax.random.fold_in(jax.random.fold_in(root, int(stream)), counter)
 
 
 def rng(seed: int, stream: Stream, counter: int) -> np.random.Generator:
-    """The NumPy generator of one episode's draws."""
+    """A NumPy generator."""
     return np.random.default_rng(np.random.SeedSequence((seed, int(stream), counter)))
 
 
 def episode_seed(seed: int, stream: Stream, counter: int) -> int:
-    """A 31-bit seed for `env.reset`, so that an episode is a function of it and of the actions alone."""
+    """A 31-bit seed for `env.reset`, so that an episode depends on this seed and the actions alone."""
     return int(np.random.SeedSequence((seed, int(stream), counter)).generate_state(1)[0] >> 1)

@@ -1,4 +1,4 @@
-"""The value types that cross the seams. They check themselves once, when they are made, and never change."""
+"""The value types that are passed between the packages. They are immutable; `Episode` checks its lengths when it is created."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from pcil.errors import InputError
 
 
 class Spec(NamedTuple):
-    """What the networks must know of an environment."""
+    """The properties of an environment that the networks depend on."""
 
     obs_dim: int
     action_dim: int
     action_repeat: int
-    """Control steps (frames) for each agent step."""
+    """The number of control steps (frames) per agent step."""
 
 
 class Origin(NamedTuple):
-    """What is known of the environment that demonstrations were recorded in; None where nothing is known."""
+    """The environment in which demonstrations were recorded; a field is None if it is unknown."""
 
     env_id: str | None = None
     """Its Gymnasium id."""
     entry_point: str | None = None
-    """Its code, as Gymnasium has it registered."""
+    """Its entry point in Gymnasium's registry."""
     kwargs: dict[str, Any] | None = None
-    """The keyword arguments it was made with, those of its registration among them."""
+    """Its keyword arguments, including those of its registration."""
     action_low: list[float] | None = None
-    """Lower bounds of the actions as the environment takes them; -1 in the demonstrations stands for these."""
+    """The lower bounds of its own action space, to which -1 in the demonstrations corresponds."""
     action_high: list[float] | None = None
-    """Upper bounds; 1 stands for these."""
+    """The upper bounds, to which 1 corresponds."""
     step_seconds: float | None = None
-    """Simulated time of one step."""
+    """The simulated duration of one step."""
 
 
 class Batch(NamedTuple):
-    """Steps, all that a reward is ever given: `action` was taken in `obs` and led to `next_obs`.
+    """Steps, as rewards are given them: `action` was taken in `obs` and led to `next_obs`.
 
-    The leading axes are `[T]` for an episode, in the order of time, and `[rows, n]` for windows of `n` steps in a row.
+    The leading axes are `[T]` for an episode in temporal order, and `[rows, n]` for windows of `n` consecutive steps.
     """
 
     obs: Float[Any, "*steps obs"]
@@ -53,7 +53,7 @@ class Batch(NamedTuple):
 
     @classmethod
     def of(cls, obs: Float[Any, "*batch states obs"], action: Float[Any, "*batch n action"], *windows: Any) -> Batch:
-        """The steps between `n + 1` states in a row; `windows` are `discount` and `episode_id`."""
+        """The steps between `n + 1` consecutive states; `windows` are `discount` and `episode_id`."""
         return cls(obs[..., :-1, :], action, obs[..., 1:, :], *windows)
 
     @property
@@ -66,8 +66,8 @@ class Window(NamedTuple):
     """`n` consecutive steps from each of `batch` random starts, all within one episode.
 
     Step `t` leads from `obs[:, t]` by `action[:, t]` to `obs[:, t + 1]` with `reward[:, t]`. `discount[:, t]` is 0 where that
-    step terminated the episode and in the padding after it, and 1 elsewhere: a time limit is no termination, and no
-    window reaches past one.
+    step terminated the episode and in the padding after it, and 1 elsewhere. A time limit is not a termination, and no window
+    extends beyond one.
     """
 
     obs: Float[Any, "batch states obs"]
@@ -75,15 +75,15 @@ class Window(NamedTuple):
     reward: Float[Any, "batch n"]
     discount: Float[Any, "batch n"]
     episode_id: Int[Any, " batch"]
-    """Which episode each window is from, counted from 0 over all that were ever added."""
+    """The episode of each window, counted from 0 over all episodes that were ever added."""
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One whole episode of `T` agent steps; the arrays are made read-only.
+    """A complete episode of `T` agent steps; its arrays are made read-only.
 
-    `obs[t]` is where `action[t]` was taken, `reward[t]` what the environment paid for it. `terminated` says that the task
-    ended (no future), otherwise the episode was cut by a time limit. `seed` is what the environment was reset with.
+    `action[t]` was taken in `obs[t]`, and `reward[t]` is the environment's reward for it. `terminated` is True if the
+    environment terminated the episode, and False if a time limit truncated it. `seed` is the seed of the reset.
     """
 
     obs: Float[np.ndarray, "states obs"]
@@ -106,12 +106,12 @@ class Episode:
         return len(self.action)
 
     def absorbed(self, steps: int = 1) -> Episode:
-        """The same episode with a further entry in each observation, 1 in the absorbing state and 0 elsewhere.
+        """The same episode with an additional entry in each observation: 1 in the absorbing state, 0 elsewhere.
 
-        An episode that terminated ends in the absorbing state (zeros and the 1) in place of its last observation, and takes
-        `steps` from there to itself, with action and reward 0; so nothing terminates, and a reward learned on such episodes
-        values an early end as it values any other state (Kostrikov et al. 2019, section 4.2). With `n` of them a window of `n`
-        steps can begin in the absorbing state, and does so once.
+        In a terminated episode, the absorbing state (zeros and the 1) replaces the last observation and is followed by `steps`
+        transitions to itself, with action and reward 0. The result is not terminated, so a reward that is learned on such
+        episodes assigns a value to an early end as to any other state (Kostrikov et al. 2019, section 4.2). With `steps = n`,
+        exactly one window of `n` steps begins in the absorbing state.
         """
         obs = np.pad(self.obs, ((0, 0), (0, 1)))
         if not self.terminated:
@@ -123,5 +123,5 @@ class Episode:
 
     @property
     def total_reward(self) -> float:
-        """The return: the undiscounted sum of the environment's rewards."""
+        """The undiscounted return of the environment's rewards."""
         return float(np.sum(self.reward, dtype=np.float64))

@@ -125,7 +125,7 @@ def test_a_reset_returns_observation_and_info(reset: Any, task: Any) -> None:
 
 
 def test_an_absent_info_is_no_matter(task: Any) -> None:
-    assert third_step(task(reset=(np.zeros(2), None), info=None))[4] is None
+    assert third_step(task(reset=(np.zeros(2), None), info=None))[4] == {}
 
 
 class Seedless(Odd):

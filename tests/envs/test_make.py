@@ -18,6 +18,7 @@ from gymnasium import spaces
 from pcil import cli, envs
 from pcil.bench.environment import measure_env
 from pcil.envs import TASKS, make, register, spec, task_name
+from pcil.envs.toy import PointMass
 from pcil.errors import InputError
 from pcil.training import runs
 from pcil.types import Spec
@@ -246,3 +247,23 @@ def test_without_deepmind_control_all_else_works(tmp_path: Path, capsys: pytest.
         runs.execute(small_run("expert", frames=150), tmp_path / "run")
     versions = json.loads((tmp_path / "run" / "run.json").read_text())["versions"]
     assert versions["jax"] == real("jax") and "dm-control" not in versions
+
+
+def test_an_environment_of_the_package_says_how_many_frames_its_steps_take() -> None:
+    class Repeating(PointMass):
+        """A suite's environment with an action repeat."""
+
+        action_repeat = 3
+
+    assert envs.spec(envs.make(PointMass)).action_repeat == 1
+    assert envs.spec(envs.make(Repeating)).action_repeat == 3
+
+
+def test_a_suite_is_one_entry_of_the_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(envs.SUITES, "grid", {"small": ("pcil.envs.toy:PointMass", {})})
+    envs.register()
+    try:
+        env = envs.make("grid/small-v0")
+    finally:
+        del gymnasium.registry["grid/small-v0"]
+    assert env.spec.id == "grid/small-v0" and isinstance(env.unwrapped, PointMass)

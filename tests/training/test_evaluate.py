@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from pcil.errors import InputError
 from pcil.seeds import Stream, episode_seed
 from pcil.training.evaluate import LOCKSTEP, Evaluation, environments_for, evaluate
 
@@ -160,3 +161,43 @@ def test_an_environment_may_reuse_its_buffer() -> None:
 
     plain = evaluate(policy, [Walk(4), Walk(4)], seed=1)
     assert evaluate(policy, [Reusing(4), Reusing(4)], seed=1).returns.tolist() == plain.returns.tolist()
+
+
+class Odd(Walk):
+    """A walk whose `info` is `kind`."""
+
+    kind: Any = None
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Any]:
+        return *super().step(action)[:4], self.kind
+
+
+@pytest.mark.parametrize("kind", [None, {}, {"contacts": [[1], [1, 2]]}, {"name": "x", "two": np.ones(2), 3: 1.0}])
+def test_an_info_without_single_numbers_gives_none(kind: Any) -> None:
+    env = Odd(3)
+    env.kind = kind
+    assert evaluate(policy, [env], seed=1, episodes=2).info == {}
+
+
+def test_an_info_that_is_no_dict_is_refused() -> None:
+    env = Odd(3)
+    env.kind = [1]
+    with pytest.raises(InputError, match=r"as info.*must be a dict"):
+        evaluate(policy, [env], seed=1)
+
+
+def test_an_environment_may_reuse_its_info() -> None:
+    class Shared(Walk):
+        """A walk that always returns one dict, with one array in it."""
+
+        held: dict[str, Any] = {"left": np.zeros(1), "seeds": 0}  # noqa: RUF012
+
+        def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Any]:
+            result = super().step(action)
+            self.held["left"][0] = self.position
+            self.held["seeds"] = len(self.seeds)
+            return *result[:4], self.held
+
+    result = evaluate(policy, [Shared(3)], seed=1, episodes=3)
+    assert result.info["seeds"].tolist() == [1, 2, 3]
+    assert len(set(result.info["left"].tolist())) == 3

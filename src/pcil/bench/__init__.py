@@ -1,7 +1,7 @@
-"""The speed of each part and its ratio to the floor, measured in one process on one thread (`pcil bench`).
+"""The speed of each part compared with a lower bound, measured in one process on one thread (`pcil bench`).
 
-The floor of an update is the time of its matrix products alone: they are read off the update's own jaxpr, so the two always
-hold the same products of the same shapes.
+The floor of an update is the time of its matrix products alone. They are taken from the jaxpr of the update, so both always
+have the same products of the same shapes.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ KEYS = (
 
 
 def use_one_thread() -> None:
-    """Ask XLA and BLAS for one thread; it works only before JAX is imported."""
+    """Limit XLA and BLAS to one thread; this has an effect only before JAX is imported."""
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
 
 
 def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
-    """The figures of `KEYS`. Parts that are compared take turns in short blocks, and a figure is the median of its blocks."""
+    """Measure the values of `KEYS`. Parts alternate in short blocks, and a value is the median over its blocks."""
     use_one_thread()
     from pcil import compilation, envs, modules
     from pcil.bench.environment import measure_env
@@ -65,7 +65,7 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
 
 
 def table(figures: dict[str, float]) -> str:
-    """The figures for a person, with the ratios that they are measured for."""
+    """The measurements as plain text, with their ratios."""
     f = figures
     return "\n".join(
         [
@@ -83,7 +83,7 @@ def table(figures: dict[str, float]) -> str:
 
 
 class Setup:
-    """One method's update on made-up data of a task's sizes, and the other parts beside it."""
+    """The parts that are measured: a method's update, acting and sampling, on random data of a task's sizes."""
 
     def __init__(self, run: Any, spec: Any) -> None:
         import jax
@@ -117,7 +117,7 @@ class Setup:
         self.products = _products(list(_dot_generals(jaxpr.jaxpr)))
 
     def update(self, times: int) -> None:
-        """`times` updates, waited for at the end."""
+        """Do `times` updates, and wait for them at the end."""
         import jax
         import numpy as np
 
@@ -129,7 +129,7 @@ class Setup:
         jax.block_until_ready((self.state, actor))
 
     def floor(self, times: int) -> None:
-        """The same number of times the matrix products of an update."""
+        """Compute the matrix products of `times` updates."""
         import jax
 
         for _ in range(times):
@@ -137,18 +137,18 @@ class Setup:
         jax.block_until_ready(results)
 
     def act(self, times: int) -> None:
-        """Actions for one observation."""
+        """Compute `times` actions for one observation."""
         for _ in range(times):
             self.explore(self.actor, self.obs, 0)
 
     def sample(self, times: int) -> None:
-        """Batches of windows."""
+        """Sample `times` batches of windows."""
         for _ in range(times):
             self.replay.sample(self.rng, self.run.agent.batch_size, self.run.agent.n_step)
 
 
 def _dot_generals(jaxpr: Any) -> Iterator[Any]:
-    """Every matrix product of a jaxpr, those of inner ones too."""
+    """Every matrix product of a jaxpr, including those of nested jaxprs."""
     from jax.extend import core
 
     for equation in jaxpr.eqns:
@@ -159,9 +159,9 @@ def _dot_generals(jaxpr: Any) -> Iterator[Any]:
 
 
 def _products(equations: list[Any]) -> Callable[[], Any]:
-    """A compiled call of these matrix products on made-up operands.
+    """A compiled function that computes these matrix products on random operands.
 
-    Left operands are distinct, so that no two products are merged; right ones are shared by shape, as weights are.
+    Left operands are distinct, so that XLA merges no two products; right operands of the same shape are shared, as weights are.
     """
     import jax
     import numpy as np
@@ -181,7 +181,7 @@ def _products(equations: list[Any]) -> Callable[[], Any]:
 
 
 def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str, float]:
-    """Median time of one call of each part, in the unit that its name ends with; the parts take turns."""
+    """The median time of one call of each part, in the unit at the end of its name; the parts alternate."""
     units = {name: 1e3 if name.endswith("_ms") else 1e6 for name in parts}
     times = {name: 20 if name.endswith("_ms") else 500 for name in parts}
     blocks: dict[str, list[float]] = {name: [] for name in parts}
@@ -197,7 +197,7 @@ def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str
 
 
 def loop_share(run: Any, seconds: float) -> tuple[float, float]:
-    """Share of a real loop's time that is spent in the update, and frames a second."""
+    """The fraction of the training loop's time that is spent in the update, and the frames per second."""
     from pcil.training import learner
 
     timing = time_loop(run, seconds, [(learner, "update")])
@@ -205,20 +205,20 @@ def loop_share(run: Any, seconds: float) -> tuple[float, float]:
 
 
 class Timing(NamedTuple):
-    """Some whole episodes of a loop."""
+    """Times of some complete episodes of a training loop."""
 
     seconds: float
     frames: int
     inside: dict[str, float]
-    """Seconds in each part."""
+    """The seconds spent in each part."""
     calls: dict[str, int]
-    """How often each part was called."""
+    """The number of calls of each part."""
 
 
 def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Timing:
-    """Run a loop for about so many seconds after compiling, and time all calls of each `owner.name` of the parts.
+    """Run the training loop for about `seconds` after compilation, and time all calls of each `owner.name` of the parts.
 
-    Each call is waited for, which the loop itself does not do, so that its time is its own.
+    The result of each call is waited for, unlike in the loop itself, so that the time is attributed to the right part.
     """
     import jax
 
@@ -227,7 +227,9 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
 
     names = [name for _, name in parts]
     inside, calls = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0)
-    ends: list[tuple[float, int, dict[str, float], dict[str, int]]] = []  # of each episode: time, frames, the two until then
+    ends: list[
+        tuple[float, int, dict[str, float], dict[str, int]]
+    ] = []  # for each episode: time, frames, and copies of both dicts
 
     def timed(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
@@ -240,7 +242,7 @@ def time_loop(run: Any, seconds: float, parts: Sequence[tuple[Any, str]]) -> Tim
         return call
 
     class Watch(Callback):
-        """Notes the end of each episode, and stops when there are enough."""
+        """Records the end of each episode, and stops the run after enough of them."""
 
         def episode(self, row: dict[str, Any]) -> None:
             ends.append((time.perf_counter(), row["frames"], dict(inside), dict(calls)))

@@ -1,4 +1,4 @@
-"""What an environment costs beside its bare physics, in one process so that the ratio survives a busy core."""
+"""The time of an environment step compared with its physics alone, in one process so that a busy core affects both."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from pcil.envs.dmc import DMCEnv
 from pcil.errors import InputError
 
 _BLOCK = 50
-"""Agent steps timed at once: env and physics take turns, so that both see the same disturbances."""
+"""The number of agent steps in a timed block; blocks of environment and physics alternate, so that load affects both."""
 
 
 def measure_env(task: str, episodes: int = 3) -> dict[str, float]:
-    """Microseconds per agent step of a DeepMind Control task: `env_step_us`, `physics_us`, and `ratio` of the two.
+    """Microseconds per agent step of a DeepMind Control task: `env_step_us`, `physics_us`, and their `ratio`.
 
-    The physics is MuJoCo's step functions alone, on the same model and along the very same states: its own copy of the
-    simulation gets the same random actions. Medians over blocks; `ratio` is the median of the ratios of neighbours.
+    `physics_us` is the time of MuJoCo's step functions alone. They run on a copy of the simulation, with the same model and the
+    same random actions, and so through the same states. Values are medians over blocks, `ratio` that of the ratios of adjacent
+    blocks.
     """
     env_us, physics_us = [], []
     with opened(task) as env:
@@ -53,7 +54,7 @@ def _microseconds(run: Callable[[], None]) -> float:
 
 
 def _bare_physics(env: DMCEnv) -> Callable[[list[np.ndarray]], None]:
-    """MuJoCo's calls of one agent step after the other, from a copy of the environment's present state."""
+    """A function that makes MuJoCo's calls of consecutive agent steps on a copy of the environment's current state."""
     mujoco: Any = importlib.import_module("mujoco")
     model, repeat = env.physics.model.ptr, range(env.action_repeat)
     data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The command line. Every command imports what it needs when it runs, so that `pcil --help` answers at once."""
+"""The command line. A command imports its dependencies when it runs, so that `pcil --help` is fast."""
 
 import importlib
 import io
@@ -20,15 +20,15 @@ COMMANDS = {
     "bench": "Measure the speed of each part, and its ratio to the floor.",
     "doctor": "Say what is installed, what is wrong, and what to do.",
 }
-"""Each is a file of this folder, with a `main` that is given its argv."""
+"""The summary of each command; `pcil.cli.<command>` has its `main(argv)`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; 0 on success, 2 on bad input, 1 where a run failed, 130 and 143 where Ctrl-C and SIGTERM stopped it."""
-    # XLA has threads of its own; those of NumPy's BLAS only wait for each other on the small matrices of this package.
+    """Run one command and return its exit code: 0 on success, 2 on invalid input, 1 if a run failed, 130 or 143 on a signal."""
+    # XLA has its own threads; more BLAS threads in NumPy would only slow down the small matrix products of this package.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")  # of a terminal that can't show every letter
+        sys.stdout.reconfigure(errors="backslashreplace")  # for terminals that can't show every character
     argv = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code = _command(argv)
@@ -40,13 +40,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # or Python would complain of the rest at its end
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())  # else Python would report the error again at exit
         return 141
     except Exception as error:
-        if not (said := errors.said(error)):
+        if not (found := errors.as_message(error)):
             raise
-        print(f"pcil: {said[0]}.", file=sys.stderr)
-        return said[1]
+        message, code = found
+        print(f"pcil: {message}.", file=sys.stderr)
+        return code
 
 
 def _command(argv: list[str]) -> int:

@@ -1,4 +1,4 @@
-"""From the arguments of a command to those of a function, by `tyro`; what does not fit is one sentence, not a framed box."""
+"""Parse the arguments of commands with `tyro`; errors are one sentence instead of tyro's framed box."""
 
 import contextlib
 import dataclasses
@@ -15,14 +15,18 @@ from pcil.modules import Trust
 
 if TYPE_CHECKING:
     from pcil.training.callbacks import Callback
-    from pcil.training.config import Run
+
+Execute = Callable[..., int]
+"""`(run, folder, callbacks) -> exit code`. The types are not spelled out, because `tyro` would have to resolve them here."""
+SEVERAL = ("callbacks",)
+"""The options of `pcil train` that take several values."""
 
 
 def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
-    """Call `function` with the arguments that `argv` gives, or show its help and return 0.
+    """Call `function` with the arguments in `argv`, or print its help and return 0; `InputError` if the arguments are invalid.
 
-    `InputError` says what does not fit. `tyro` prints that in a box on standard error and exits; only its parsing is listened
-    to, so what `function` itself writes there goes there at once.
+    `tyro` prints errors in a box on standard error and exits. Standard error is captured only during parsing, not while
+    `function` runs.
     """
     import tyro
 
@@ -31,7 +35,7 @@ def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
         return functools.partial(function, *positional, **named)
 
     if {"-h", "--help"} & set(argv):
-        argv = ["--help"]  # tyro's help leaves out the positional arguments that it has read before
+        argv = ["--help"]  # tyro's help would omit positional arguments that it has parsed before
     box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
@@ -43,15 +47,15 @@ def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
     return bound()
 
 
-def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"], int]) -> int:
-    """Call `execute` with the run, the folder and the callbacks that the arguments of `pcil train` give."""
+def train(argv: list[str], execute: Execute) -> int:
+    """Call `execute` with the run, the folder and the callbacks from the arguments of `pcil train`."""
     import tyro
 
     from pcil import envs, modules
     from pcil.training import presets
     from pcil.training.config import REGISTRIES, Run
 
-    argv = [_renamed(word) for word in argv]
+    argv = [_renamed(argument) for argument in argv]
     given = peek(argv)
     if "settings" in given:
         return _train_again(argv, execute)
@@ -63,7 +67,7 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
         argv = without(argv, part)
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)
     if "reward" in given and "method" not in given:
-        default = dataclasses.replace(default, method=given["reward"])  # its results go by its own name
+        default = dataclasses.replace(default, method=given["reward"])  # the results are named after the reward
     if "task" not in given and not {"-h", "--help"} & set(argv):
         raise InputError(f"The task is missing; name one of {', '.join(envs.TASKS)}, or any Gymnasium id.")
 
@@ -74,12 +78,12 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
     ) -> int:
         """Train a policy, or resume where a run stopped.
 
-        The settings shown are those of the chosen method and preset. --reward and --agent take one by its name, or
-        my.module:MyReward, one of your own; --settings FILE takes all settings from the run.json of another run.
+        The defaults shown are those of the chosen method and preset. --reward and --agent take a name, or a class of your own
+        such as my.module:MyReward; --settings FILE takes all settings from the run.json of another run.
 
         Args:
             out: The run's folder; one that holds the same run resumes it.
-            callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
+            callbacks: Loggers of your own, such as my.module:MyLogger.
         """
         modules.admit("The task", modules.of_task(task), None)
         modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), None)
@@ -88,7 +92,7 @@ def train(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"]
     return call("train", train, argv)
 
 
-def _train_again(argv: list[str], execute: Callable[["Run", Path, "Sequence[Callback]"], int]) -> int:
+def _train_again(argv: list[str], execute: Execute) -> int:
     def train(settings: str, out: Path, callbacks: tuple[str, ...] = (), trust: Trust = ()) -> int:
         """Train a policy with the settings of another run, or resume where a run stopped.
 
@@ -103,21 +107,15 @@ def _train_again(argv: list[str], execute: Callable[["Run", Path, "Sequence[Call
     return call("train", train, argv)
 
 
-def _run_of(settings: str, trust: Sequence[str]) -> "Run":
+def _run_of(settings: str, trust: Sequence[str]) -> Any:
     """The run of a `run.json`, by its path or its content; `trust` are the modules that it may name."""
     from pcil import files, modules
-    from pcil.training.config import REGISTRIES, Run, part_of_run
+    from pcil.training import config
 
     source = "--settings" if settings.lstrip().startswith("{") else settings
     try:
         table = files.parse_json(settings.encode()) if source == "--settings" else files.read_json(Path(settings))
-        flat = files.flat(table.get("run", table))
-        classes = {}
-        for part in REGISTRIES:
-            if named := modules.of_class(path := flat[f"{part}.class"]):
-                modules.admit(source, named, trust)
-                classes[path] = part_of_run(part, path)
-        run = Run.from_json(flat, classes)
+        run = config.run_of_file(source, table.get("run", table), trust)
     except InputError:
         raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -127,55 +125,55 @@ def _run_of(settings: str, trust: Sequence[str]) -> "Run":
 
 
 def _callbacks(specs: Sequence[str]) -> "list[Callback]":
-    """An object of each class that was named."""
+    """Create an object of each named class."""
     from pcil import modules
     from pcil.training.callbacks import Callback
 
     modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec)], None)
-    return [modules.made("--callbacks", spec, Callback, "my.module:MyLogger") for spec in specs]
+    classes = [modules.load("--callbacks", spec, Callback, "my.module:MyLogger") for spec in specs]
+    return [modules.instance("--callbacks", kind) for kind in classes]
 
 
-def _renamed(word: str) -> str:
-    """A word of the command line with a setting by the name that it has today, which is said of an older one."""
+def _renamed(argument: str) -> str:
+    """An argument in which an option's old name is replaced by the current one, with a note on standard error."""
     from pcil.training.config import RENAMED
 
-    option, equals, value = word.partition("=")
+    option, equals, value = argument.partition("=")
     name = option.removeprefix("--").replace("-", "_")
     if not option.startswith("--") or name not in RENAMED:
-        return word
+        return argument
     print(f"pcil: {option} is now called --{RENAMED[name].replace('_', '-')}.", file=sys.stderr)
     return f"--{RENAMED[name].replace('_', '-')}{equals}{value}"
 
 
 def peek(argv: list[str]) -> dict[str, str]:
-    """The values of the options as they are given, before the method has decided which options there are."""
-    given, rest = {}, iter(argv)
-    for word in rest:
-        if word.startswith("--") and "=" in word:
-            name, value = word[2:].split("=", 1)
-            given[name] = value
-        elif word.startswith("--"):
-            given[word[2:]] = next(rest, "")
-        elif not word.startswith("-"):
-            given["task"] = word
+    """The raw values of the options, and of the task; needed because the available options depend on the method."""
+    given, rest, several = {}, iter(argv), False
+    for argument in rest:
+        if argument.startswith("--"):
+            name, equals, value = argument[2:].partition("=")
+            given[name] = value if equals else next(rest, "")
+            several = name in SEVERAL and not equals
+        elif not argument.startswith("-") and not several:
+            given["task"] = argument
     return given
 
 
 def without(argv: list[str], name: str) -> list[str]:
     """`argv` without `--name VALUE` and `--name=VALUE`."""
     left, rest = [], iter(argv)
-    for word in rest:
-        if word == f"--{name}":
+    for argument in rest:
+        if argument == f"--{name}":
             next(rest, None)
-        elif not word.startswith(f"--{name}="):
-            left.append(word)
+        elif not argument.startswith(f"--{name}="):
+            left.append(argument)
     return left
 
 
 def _complaint(box: str) -> str:
-    """What `tyro` says in a box, with the option that was meant: the rows up to the first rule, then that option.
+    """The error message in `tyro`'s box as one sentence: the rows above the first rule, and the suggestion below it.
 
-    The frame depends on the terminal: lines and colours, or blanks. Help texts are indented by 8.
+    Depending on the terminal, the frame consists of lines and colours, or of blanks. Help texts are indented by 8.
     """
     plain = re.sub(r"\x1b\[[\d;]*m", "", box)
     rows = [row.rstrip(" │") for row in re.findall(r"^[│ ] (.*)$", plain, flags=re.MULTILINE)]
@@ -183,14 +181,14 @@ def _complaint(box: str) -> str:
     wrong = " ".join(row.strip() for row in rows[:rule] if row.strip() and not row.startswith(" " * 8))
     wrong = wrong.rstrip(".").replace(". E", "; e") or "The arguments do not fit"
     meant = dict(zip(rows[rule + 1 :], rows[rule + 2 :], strict=False))
-    for header, words in (("Argument helptext:", "it takes"), ("Perhaps you meant:", "perhaps you meant")):
+    for header, prefix in (("Argument helptext:", "it takes"), ("Perhaps you meant:", "perhaps you meant")):
         if header in meant:
-            wrong += f"; {words} {meant[header].strip()}"
+            wrong += f"; {prefix} {meant[header].strip()}"
     return wrong
 
 
 def within(least: int, most: int, **options: int) -> None:
-    """`InputError` where the number of an option is out of its limits."""
+    """`InputError` if the value of an option is out of its limits."""
     for name, value in options.items():
         if not least <= value <= most:
             limit = f"at least {least}" if value < least else f"at most {most:,}"

@@ -15,12 +15,12 @@ def bench(
     seconds: float = 20.0,
     json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Measure the speed of each part, and its ratio to the floor, on one thread.
+    """Measure the speed of each part, and its ratio to a lower bound, on one thread.
 
     Args:
-        task: The environment, and the sizes of its networks.
-        preset: Settings of PCIL whose update is measured.
-        seconds: About how long to measure.
+        task: The environment, which also determines the sizes of the networks.
+        preset: The preset of PCIL whose update is measured.
+        seconds: The approximate duration of the measurement.
         json_output: Print one JSON object and nothing else.
     """
     from pcil import bench

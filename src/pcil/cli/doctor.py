@@ -1,4 +1,4 @@
-"""What is installed, what is wrong, and what to do about it."""
+"""`pcil doctor`: what is installed, what is wrong, and how to fix it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pcil.cli import arguments
 from pcil.errors import shown
 
 Check = tuple[str, Callable[[], str], str, bool]
-"""What is checked, how (returns a finding, raises where it fails), what to do then, and whether training needs it."""
+"""Name, function (returns a finding, raises if the check fails), remedy, and whether training needs it."""
 
 
 def doctor() -> int:
@@ -27,11 +27,11 @@ def doctor() -> int:
     for name, look, remedy, needed in CHECKS:
         try:
             found, advice, mark = look(), "", "[green]ok[/]"
-        except Exception as error:  # whatever a broken install raises is the finding
+        except Exception as error:  # a broken installation may raise anything
             found, advice = f"{type(error).__name__}: {error}".splitlines()[0][:90], remedy
             mark = "[red]wrong[/]" if needed else "[yellow]absent[/]"
             broken |= needed
-        table.add_row(mark, name, Text(shown(found)), Text(advice))  # brackets, as in .[report], are text and no markup
+        table.add_row(mark, name, Text(shown(found)), Text(advice))  # brackets, as in .[report], are not markup
     Console().print(table)
     return int(broken)
 

@@ -27,12 +27,12 @@ def evaluate(
     """Roll out the policy of a run, without exploration.
 
     Args:
-        folder: A run's folder, or one that holds policy.json and policy.safetensors.
-        episodes: How many.
-        seed: The episodes' starts follow from it.
-        env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
-        single_environment: Play one episode after the other in one environment: slower, with the same results.
-        trust: Modules that the policy's files may name, whose code is then run, such as my.module.
+        folder: The folder of a run, or one with policy.json and policy.safetensors.
+        episodes: The number of episodes.
+        seed: The seed of the initial states.
+        env_kwargs: Keyword arguments of the environment, as a JSON object; by default those of the training.
+        single_environment: Run the episodes one after the other in one environment: slower, with the same results.
+        trust: Modules that the policy's files may name and whose code is then run, such as my.module.
         json_output: Print one JSON object and nothing else.
     """
     from pcil.training.evaluate import environments_for, playable
@@ -42,7 +42,7 @@ def evaluate(
     arguments.within(0, 2**31 - 1, seed=seed)
     policy, env_kwargs = playable(folder, env_kwargs, trust)
     copies = environments_for(policy.task, episodes, env_kwargs, single=single_environment)
-    with contextlib.redirect_stdout(sys.stderr), copies as (_, made):  # an environment may print
+    with contextlib.redirect_stdout(sys.stderr), copies as (_, made):  # environments may print
         policy.check_fits(made[0])
         result = roll_out(policy, made, seed=seed, episodes=episodes)
     row = {"task": policy.task, "episodes": episodes, "seed": seed, "return_mean": result.mean}

@@ -23,13 +23,13 @@ def record(
     """Record demonstrations from a trained policy, as a Minari dataset.
 
     Args:
-        folder: A run's folder, or one that holds policy.json and policy.safetensors.
+        folder: The folder of a run, or one with policy.json and policy.safetensors.
         out: The dataset's folder; it must not exist.
-        episodes: How many.
-        seed: The episodes' starts follow from it.
-        minimum_return: Keep only episodes of at least this return.
-        env_kwargs: Keyword arguments of the environment, as a JSON object; by default those it was trained with.
-        trust: Modules that the policy's files may name, whose code is then run, such as my.module.
+        episodes: The number of episodes.
+        seed: The seed of the initial states.
+        minimum_return: Keep only episodes with at least this return.
+        env_kwargs: Keyword arguments of the environment, as a JSON object; by default those of the training.
+        trust: Modules that the policy's files may name and whose code is then run, such as my.module.
     """
     from pcil import demos, envs
     from pcil.training import evaluate, runs

@@ -1,4 +1,4 @@
-"""`pcil report`: what lies below some folders, what its networks show, and a page of it all."""
+"""`pcil report`: collect runs, analyse their representations, and write a page."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def report(
     """Draw figures, tables and a page from runs.
 
     Args:
-        paths: Run folders, folders that hold some at any depth, or files like results/*.csv.
+        paths: Run folders, folders that contain some at any depth, or files like results/*.csv.
         out: The report's folder, with index.html, figures and tables.
-        rollouts: Play an episode with the networks of each run: their representation, and an animation of each method.
-        trust: Modules that the runs' files may name, whose code is then run, such as my.module.
+        rollouts: Run an episode with the networks of each run, for their representations and an animation of each method.
+        trust: Modules that the runs' files may name and whose code is then run, such as my.module.
     """
     try:
         from pcil.report import load, page
@@ -46,7 +46,7 @@ def report(
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """`pcil.report.representation:with_defaults`, which loads JAX: a report of files of results alone does without."""
+    """`pcil.report.representation:with_defaults`, imported late: it loads JAX, which reports of result files do not need."""
     from pcil.report.representation import with_defaults
 
     return with_defaults(settings)

@@ -1,4 +1,4 @@
-"""`pcil sweep`: a file of runs, or tasks with methods and seeds."""
+"""`pcil sweep`: train the runs of a file, or of tasks, methods and seeds."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ from pcil.errors import InputError
 from pcil.modules import Trust
 
 _OF_TASKS = {"--methods", "--seeds", "--preset", "--frames"}
-"""Options of tasks; a file says of itself what they would."""
+"""The options that apply to tasks; a file has these settings itself."""
 
 
 def main(argv: list[str]) -> int:
@@ -27,20 +27,20 @@ def main(argv: list[str]) -> int:
         address: str | None = None,
         trust: Trust = (),
     ) -> int:
-        """Train many runs, side by side; the same command skips what is done and resumes the rest.
+        """Train many runs in parallel; the same command skips what is done and resumes the rest.
 
-        Exit code 1 says that a run failed; the others were finished all the same.
+        Exit code 1 means that a run failed; the others were finished nevertheless.
 
         Args:
             what: The runs, in a TOML file (docs/sweeps.md says how), or tasks, each with every method and seed.
             out: Each run's folder is OUT/TASK/METHOD/SEED.
-            methods: Methods, where tasks are named.
-            seeds: Seeds, where tasks are named.
-            preset: Their settings, as in pcil train.
-            frames: Their length; by default as in pcil train.
-            jobs: Runs at the same time; by default as many as there are cores for.
-            address: A Ray cluster, such as 10.0.0.1:6379; by default the runs are trained on this machine.
-            trust: Modules that the file may name as tasks or rewards, whose code is then run, such as my.module.
+            methods: The methods, if tasks are given.
+            seeds: The seeds, if tasks are given.
+            preset: The preset, as in pcil train, if tasks are given.
+            frames: The frames of each run, if tasks are given; by default as in pcil train.
+            jobs: The number of simultaneous runs; by default as many as there are cores for.
+            address: The address of a Ray cluster, such as 10.0.0.1:6379; by default runs are trained on this machine.
+            trust: Modules that the file may name and whose code is then run, such as my.module.
         """
         from pcil import files, sweep
         from pcil.sweep import plans
@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
             table: dict[str, Any] = {"tasks": list(what), "methods": list(methods), "seeds": list(seeds), "preset": preset}
             table |= {} if frames is None else {"frames": frames}
             plan = plans.of_table("The command", table, out, None)
-        elif other := [*what[1:], *sorted({word.partition("=")[0] for word in argv} & _OF_TASKS)]:
+        elif other := [*what[1:], *sorted({argument.partition("=")[0] for argument in argv} & _OF_TASKS)]:
             raise InputError(f"{other[0]} is given beside {what[0]}; a file says itself what its runs are.")
         else:
             plan = plans.read(Path(what[0]), out, trust)

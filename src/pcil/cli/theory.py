@@ -15,8 +15,8 @@ def theory(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, 
     """Check the paper's Theorem 1 numerically, and draw it.
 
     Args:
-        out: Folder of theory.png and theory.pdf; by default the current one, or no figure with --json.
-        seed: The random pairs follow from it.
+        out: The folder for theory.png and theory.pdf; by default the current one, or no figure with --json.
+        seed: The seed of the random pairs.
         json_output: Print one JSON object and nothing else.
     """
     from pcil import theory

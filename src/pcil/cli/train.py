@@ -16,7 +16,7 @@ def main(argv: list[str]) -> int:
 
 
 def _run(run: "Run", out: Path, callbacks: "Sequence[Callback]") -> int:
-    """Execute with a progress bar; end with a plain statement of how close to the expert it came, and the curve."""
+    """Train with a progress bar; finally print the return compared with the expert's, and draw the learning curve."""
     from pcil.training import loop, progress, runs
 
     with progress.Bar(progress.Screen(), _shipped_return(run)) as bar:
@@ -48,7 +48,7 @@ def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
 
 
 def _shipped_return(run: "Run") -> float | None:
-    """The mean return of the demonstrations that ship for the task of a run that needs none."""
+    """The mean return of the shipped demonstrations of the task, if the run itself does not need demonstrations."""
     from pcil import envs
     from pcil.demos import shipped
 

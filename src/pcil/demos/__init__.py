@@ -1,4 +1,4 @@
-"""Demonstrations: read, checked, recorded and written as Minari datasets (HDF5 + JSON). Nothing is ever downloaded."""
+"""Demonstrations: load, check, record and save them as Minari datasets (HDF5 and JSON). Nothing is ever downloaded."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ import numpy as np
 from jaxtyping import Float
 
 from pcil import envs, files, seeds
-from pcil.demos.arrays import episodes_of
+from pcil.demos.arrays import episodes_of, to_unit_box
 from pcil.demos.minari import Stored, read, reason, task_of, write
 from pcil.envs.rollout import Rollout
 from pcil.errors import InputError, brief
 from pcil.types import Episode, Origin, Spec
 
-SHIPPED = Path(__file__).parent.parent / "data" / "demos"  # a Minari root, so that plain Minari can load what ships
-ACTION_TOLERANCE = 1e-6  # how far rounding may carry an action out of [-1, 1]
-ATTEMPTS_PER_EPISODE = 10  # `record` gives up after so many rollouts for each episode that was asked for
+SHIPPED = Path(__file__).parent.parent / "data" / "demos"  # laid out as a Minari root, so that Minari can load it too
+ACTION_TOLERANCE = 1e-6  # how far outside [-1, 1] rounding may put an action
+ATTEMPTS_PER_EPISODE = 10  # `record` gives up after this many attempts per requested episode
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Whole episodes of an expert, with flat observations and with actions in [-1, 1].
+    """Complete episodes of an expert, with flat observations and with actions in [-1, 1].
 
-    `task` is a shipped task's name ("walker_walk") or a Gymnasium id. `info` says where the episodes come from and must
-    be JSON; `shipped` shows its keys `expert` (one line: method, frames, seed), `frames` and `seeds_tried`. `origin` is what is
-    known of the environment. Without actions (`has_actions`) an episode has rows of no numbers in their place, without rewards
-    (`has_rewards`) zeros, and whatever asks for them raises `InputError`.
+    `task` is the name of a shipped task ("walker_walk") or a Gymnasium id. `info` describes where the episodes come from and
+    must be serialisable as JSON; `shipped` shows its keys `expert` (one line: method, frames, seed), `frames` and
+    `seeds_tried`. `origin` describes the environment as far as it is known. If `has_actions` is False, the action arrays have
+    shape `[T, 0]`; if `has_rewards` is False, the rewards are 0. Properties that need what is missing raise `InputError`.
     """
 
     task: str
@@ -56,9 +56,12 @@ class Demonstrations:
         task: str = "arrays",
         info: dict[str, Any] | None = None,
     ) -> Demonstrations:
-        """Demonstrations of lists with one array for each episode: `obs` [T+1, O], `actions` [T, A] in [-1, 1] (see `clip`),
-        `rewards` [T], and whether it `terminated`, True or False (by default none did). Without actions or rewards, methods
-        that read none can be trained. `InputError` names the array that does not fit."""
+        """Create demonstrations from lists with one entry per episode.
+
+        `obs` are [T+1, O], `actions` [T, A] in [-1, 1] (see `clip`) and `rewards` [T]; `terminated` are True or False (by
+        default False for all). Without actions or rewards, only methods that do not read them can be trained. `InputError`
+        names the first invalid array.
+        """
         parts = episodes_of(obs, actions, rewards, terminated)
         made = cls(task, parts, info or {}, has_actions=actions is not None, has_rewards=rewards is not None)
         _check(made, "the arrays", bounded=False)
@@ -66,13 +69,13 @@ class Demonstrations:
 
     @classmethod
     def load(cls, spec: str | Path, *, bounded: bool = True) -> Demonstrations:
-        """The demonstrations that `spec` names; `InputError` says what is wrong with it or with them.
+        """Load the demonstrations that `spec` names; `InputError` if there are none or if they are invalid.
 
-        `spec` is, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the path of a
-        Minari dataset folder (or of the `data` folder in it), the id of a dataset in the user's local Minari root.
-        Dict observations are flattened as FlattenObservation does it, and actions brought from the dataset's Box to [-1, 1].
-        All that Minari knows of a foreign dataset becomes its `info`. Arrays without the checksum that `save` wrote are
-        refused, and actions out of bounds; with `bounded=False` these stay, for `clip`.
+        `spec` is one of the following, tried in this order: a shipped task ("walker_walk" or "dmc/walker_walk/expert-v0"), the
+        path of a Minari dataset folder (or of its `data` folder), or the id of a dataset in the local Minari root.
+        Dict observations are flattened in the order of Gymnasium's FlattenObservation, and actions are rescaled from the
+        dataset's Box to [-1, 1]. The Minari metadata of a dataset that `save` did not write becomes its `info`. Arrays that do
+        not match the checksum written by `save` are refused. So are actions out of bounds, unless `bounded` is False.
         """
         data = _find(spec)
         stored = read(data, trusted=data.is_relative_to(SHIPPED))
@@ -87,39 +90,39 @@ class Demonstrations:
 
     @property
     def num_steps(self) -> int:
-        """Agent steps in all episodes together; each is one row of `obs` and `action`."""
+        """The total number of agent steps, which is the number of rows of `obs` and `action`."""
         return sum(len(episode) for episode in self.episodes)
 
     @property
     def returns(self) -> Float[np.ndarray, " episodes"]:
-        """The undiscounted sum of the environment's rewards, for each episode, in float64."""
+        """The undiscounted return of each episode, in float64."""
         self._must_have("rewards")
         return np.array([episode.total_reward for episode in self.episodes], np.float64)
 
     @property
     def return_mean(self) -> float | None:
-        """The mean return of an episode; None without rewards."""
+        """The mean return; None without rewards."""
         return float(self.returns.mean()) if self.has_rewards else None
 
     @property
     def return_std(self) -> float | None:
-        """The population standard deviation of the returns, divided by the number of episodes; None without rewards."""
+        """The population standard deviation of the returns (with divisor N, not N - 1); None without rewards."""
         return float(self.returns.std()) if self.has_rewards else None
 
     @property
     def obs(self) -> Float[np.ndarray, "N O"]:
-        """All states in which an action was taken, in a new array: each episode's final observation is left out."""
+        """The observations of all steps in a new array, without each episode's final observation."""
         return np.concatenate([episode.obs[:-1] for episode in self.episodes])
 
     @property
     def action(self) -> Float[np.ndarray, "N A"]:
-        """The actions taken in `obs`, row by row, in a new array."""
+        """The actions of all steps in a new array; row `i` was taken in row `i` of `obs`."""
         self._must_have("actions")
         return np.concatenate([episode.action for episode in self.episodes])
 
     @property
     def hash(self) -> str:
-        """Hexadecimal SHA-256 of the observations, actions, rewards and terminations; saving and loading keep it."""
+        """The hexadecimal SHA-256 of observations, actions, rewards and terminations; saving and loading keep it."""
         digest = hashlib.sha256(" ".join(self._absent).encode())
         for episode in self.episodes:
             for array, dtype in ((episode.obs, "<f4"), (episode.action, "<f4"), (episode.reward, "<f8")):
@@ -127,8 +130,8 @@ class Demonstrations:
         return digest.hexdigest()
 
     def validate(self, spec: Spec | None) -> Demonstrations:
-        """These demonstrations; `InputError` if there are none, if values are not finite, if actions leave [-1, 1], or if
-        shapes differ from those of the environment's `spec` (from the first episode's, if that is None)."""
+        """Return these demonstrations; `InputError` if there are no episodes, if values are not finite, if actions are outside
+        [-1, 1], or if shapes differ from those of the environment's `spec` (of the first episode if `spec` is None)."""
         _check(self, f"the demonstrations of {self.task}", spec)
         return self
 
@@ -138,19 +141,19 @@ class Demonstrations:
         return dataclasses.replace(self, episodes=tuple(parts))
 
     def take(self, n: int | None) -> Demonstrations:
-        """The first `n` episodes; all of them if `n` is None. `InputError` if there are not as many, or `n` < 1."""
+        """The first `n` episodes, or all of them if `n` is None; `InputError` if `n` < 1 or if there are fewer than `n`."""
         available = len(self.episodes)
         if n is not None and not 1 <= n <= available:
             raise InputError(f"{n} demonstrations of {self.task} were asked for, but 1 to {available} can be had.")
         return dataclasses.replace(self, episodes=self.episodes[:n])
 
     def save(self, path: str | Path, *, dataset_id: str | None = None) -> Path:
-        """Write a Minari dataset folder at `path`, whole or not at all, and return its absolute path.
+        """Write a Minari dataset folder at `path`, completely or not at all, and return its absolute path.
 
-        Observations and actions are written as float32, rewards as they are, and NaN for what is absent. Without
-        `dataset_id`, the id is the path below the Minari root, or is made of the folder's name. The environment's
-        specification goes along if Gymnasium has it registered. `InputError` if something is there already or the place can
-        not be written.
+        Observations and actions are written as float32, rewards with their own dtype, and missing actions or rewards as NaN.
+        The default `dataset_id` is the path relative to the Minari root, or is derived from the folder's name. The dataset
+        includes the environment's specification if it is registered with Gymnasium. `InputError` if `path` exists already or
+        can not be written.
         """
         self.validate(None)
         folder = free_folder(path)
@@ -162,7 +165,7 @@ class Demonstrations:
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as scratch:
                 unfinished = Path(scratch) / "dataset"
                 size = sum(e.obs.nbytes + e.action.nbytes + e.reward.nbytes for e in self.episodes)
-                files.reserve(Path(scratch), 2 * size + 2**16 * len(self.episodes) + 2**20)  # HDF5 dies on a full disk
+                files.reserve(Path(scratch), 2 * size + 2**16 * len(self.episodes) + 2**20)  # HDF5 crashes if the disk is full
                 write(unfinished / "data", dataset_id, Stored(*(getattr(self, name) for name in Stored._fields)))
                 unfinished.rename(folder)
         except (OSError, TypeError, ValueError) as error:
@@ -180,7 +183,7 @@ class Demonstrations:
 
 
 def free_folder(path: str | Path) -> Path:
-    """The absolute path of a folder that is still to be made, or is empty; `InputError` where something is there."""
+    """The absolute path of a folder that does not exist yet or is empty; `InputError` if it holds anything."""
     folder = _expanded(Path(path)).resolve()
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -200,11 +203,11 @@ def record(
     minimum_return: float | None = None,
     info: dict[str, Any],
 ) -> Demonstrations:
-    """`episodes` episodes of `policy`, a function of the arguments alone: attempt k is reset with the k-th seed.
+    """Record `episodes` episodes of `policy`. The result depends on the arguments alone: attempt k is reset with the k-th seed.
 
-    `policy` maps an observation [O] in float32 to an action [A] within the bounds of `env`, which are brought to [-1, 1] in
-    what is kept. Episodes that return less than `minimum_return` are dropped and tried again with the next seed. `info` is
-    kept; `record_*` keys are added to it.
+    `policy` maps a float32 observation [O] to an action [A] within the bounds of `env`; the recorded actions are rescaled to
+    [-1, 1]. An episode whose return is below `minimum_return` is discarded and replaced by one with the next seed. The
+    demonstrations have `info` and some additional `record_*` keys.
     """
     if episodes < 1:
         raise InputError(f"{episodes} episodes were asked for, but at least 1 must be recorded.")
@@ -214,7 +217,7 @@ def record(
     for attempt in range(limit := ATTEMPTS_PER_EPISODE * episodes):
         rollout = Rollout([env], [seeds.episode_seed(seed, seeds.Stream.RECORD, attempt)], [f"recorded episode {attempt + 1}"])
         while rollout.playing:
-            with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
+            with np.errstate(over="ignore"):  # values too large for float32 become infinite and are refused by `step`
                 action = env.checked_action(policy(rollout.obs[0])).astype(np.float32)
             rollout.step([action])
         (episode,) = rollout.episodes()
@@ -230,36 +233,35 @@ def record(
 
 
 def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:
-    """The episode with actions brought from their bounds to [-1, 1]."""
+    """The episode with its actions rescaled from the bounds of `space` to [-1, 1]."""
     if not isinstance(space, gymnasium.spaces.Box) or not space.is_bounded():
         raise InputError(f"Demonstrations need actions in a Box with finite bounds; those of the environment are {space}.")
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     if (low == -1).all() and (high == 1).all():
         return episode
-    action = (episode.action - (high + low) / 2) / ((high - low) / 2)
-    return dataclasses.replace(episode, action=action.astype(np.float32))
+    return dataclasses.replace(episode, action=to_unit_box(episode.action, low, high).astype(np.float32))
 
 
 def shipped_tasks() -> list[str]:
-    """The names of the tasks whose demonstrations lie in the package."""
+    """The names of the tasks whose demonstrations ship with the package."""
     return sorted(path.parents[2].name for path in SHIPPED.glob("dmc/*/expert-v0/data/metadata.json"))
 
 
 def shipped() -> list[dict[str, Any]]:
-    """One row for each shipped dataset, read from the data itself except for what only `info` knows (else None)."""
+    """One row per shipped dataset. All values are computed from the data, except those that only `info` has (else None)."""
     rows = []
     for demos in map(Demonstrations.load, shipped_tasks()):
         dims = {"observation_dim": demos.obs.shape[1], "action_dim": demos.action.shape[1]}
         counts = {"episodes": len(demos.episodes), "steps": demos.num_steps}
         returns = {"return_mean": demos.return_mean, "return_std": demos.return_std}
         returns |= {"return_min": float(demos.returns.min()), "return_max": float(demos.returns.max())}
-        told = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
-        rows.append({"task": demos.task, **dims, **counts, **returns, **told, "hash": demos.hash})
+        known = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
+        rows.append({"task": demos.task, **dims, **counts, **returns, **known, "hash": demos.hash})
     return rows
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """The rows of `shipped`, one line a dataset, for people."""
+    """The rows of `shipped` as a plain-text table, one line per dataset."""
     sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
     lines = [f"{'task':<18}{sizes}{'return':>15}{'min':>7}{'max':>7}{'tries':>6}  {'hash':<10}expert"]
     for row in rows:
@@ -272,7 +274,7 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, bounded: bool = True) -> None:
-    """Refuse what `Demonstrations.validate` says, naming `source`."""
+    """Raise the `InputError` of `Demonstrations.validate`, with `source` in its message."""
     episodes = demos.episodes
     if not episodes:
         raise InputError(f"There are no episodes in {source}, but at least one is needed.")
@@ -287,16 +289,15 @@ def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, boun
     obs_dim, action_dim = (spec.obs_dim, spec.action_dim) if spec else (first.obs.shape[-1], first.action.shape[-1])
     action_dim = action_dim if demos.has_actions else first.action.shape[-1]
     for index, episode in enumerate(episodes):
-        where, steps = f"Episode {index} of {source}", len(episode)
-        for name, shape in (("obs", (steps + 1, obs_dim)), ("action", (steps, action_dim)), ("reward", (steps,))):
+        where = f"Episode {index} of {source}"
+        for name, row in (("obs", (obs_dim,)), ("action", (action_dim,)), ("reward", ())):  # `Episode` has checked the lengths
             array = getattr(episode, name)
-            if array.shape != shape:
+            if array.shape != (shape := (len(array), *row)):
                 whose = "in this environment" if spec else "after the first episode"
                 raise InputError(f"{where} has {name} of shape {array.shape}, but {whose} it must be {shape}.")
             if not np.isfinite(array).all():
                 raise InputError(f"{where} has NaN or infinite values in {name}, but all must be finite.")
-        low, high = (float(f(episode.action, initial=0)) for f in (np.min, np.max))
-        if bounded and max(-low, high) > 1 + ACTION_TOLERANCE:
+        if bounded and np.abs(episode.action).max(initial=0) > 1 + ACTION_TOLERANCE:
             low, high = float(episode.action.min()), float(episode.action.max())
             raise InputError(
                 f"{where} has actions from {low:.7g} to {high:.7g}, but their bounds are [-1, 1]; --clip-actions True (or "
@@ -305,7 +306,7 @@ def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, boun
 
 
 def _find(spec: str | Path) -> Path:
-    """The folder with the `metadata.json` of the dataset that `spec` names."""
+    """The folder that holds `metadata.json` of the dataset that `spec` names."""
     names = shipped_tasks()
     if isinstance(spec, str) and task_of(spec) in names:
         places = [SHIPPED / "dmc" / task_of(spec) / "expert-v0"]
@@ -322,12 +323,12 @@ def _find(spec: str | Path) -> Path:
 
 
 def _minari_root() -> Path:
-    """Where Minari looks for datasets; unlike Minari's own function, this does not make the folder."""
+    """The folder in which Minari looks for datasets; unlike Minari's own function, this does not create it."""
     return _expanded(Path(os.environ.get("MINARI_DATASETS_PATH", "~/.minari/datasets")))
 
 
 def _expanded(path: Path) -> Path:
-    """A path with "~" put in, as it is where nobody knows whose home is meant."""
+    """The path with "~" expanded; unchanged if the home directory can't be determined."""
     try:
         return path.expanduser()
     except RuntimeError:
@@ -335,7 +336,7 @@ def _expanded(path: Path) -> Path:
 
 
 def _dataset_id(folder: Path) -> str:
-    """The path below a Minari root, as Minari wants it; elsewhere the folder's name, made into an id."""
+    """The path relative to a Minari root, as Minari requires it; outside of one, an id derived from the folder's name."""
     for root in (SHIPPED.resolve(), _minari_root().resolve()):
         if folder.is_relative_to(root):
             return folder.relative_to(root).as_posix()

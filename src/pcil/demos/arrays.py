@@ -1,4 +1,4 @@
-"""Episodes out of plain arrays that a person gives, whatever these may hold."""
+"""Episodes from plain arrays, with a check of everything that a user may pass."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from pcil.types import Episode
 
 
 def episodes_of(obs: Any, actions: Any, rewards: Any, terminated: Any) -> tuple[Episode, ...]:
-    """One episode for each entry of `obs`; `Demonstrations.from_arrays` says what the arguments are.
+    """One episode per entry of `obs`; the arguments are those of `Demonstrations.from_arrays`.
 
-    Where there are no actions they are rows of no numbers, where there are no rewards they are 0. `InputError` names the first
-    array that does not fit.
+    Missing actions become arrays of shape `[T, 0]`, and missing rewards become 0. `InputError` names the first invalid array.
     """
     obs = _listed("obs", obs)
     count = len(obs)
@@ -42,8 +41,13 @@ def episodes_of(obs: Any, actions: Any, rewards: Any, terminated: Any) -> tuple[
     return tuple(episodes)
 
 
+def to_unit_box(actions: Any, low: Any, high: Any) -> np.ndarray:
+    """Actions rescaled from `[low, high]` to [-1, 1]."""
+    return (actions - (high + low) / 2) / ((high - low) / 2)
+
+
 def _listed(name: str, values: Any, count: int | None = None) -> list[Any]:
-    """`values` as a list, which must have `count` entries."""
+    """`values` as a list, which must have `count` entries if that is given."""
     try:
         values = list(values)
     except TypeError:
@@ -55,7 +59,7 @@ def _listed(name: str, values: Any, count: int | None = None) -> list[Any]:
 
 
 def _numbers(name: str, value: Any, shape: str, rows: int | None = None) -> np.ndarray:
-    """`value` as an array in float64 of the rank that `shape` shows, with so many rows of at least one finite number."""
+    """`value` as a float64 array of finite numbers with the rank of `shape` and, if given, this number of `rows`."""
     try:
         array = np.asarray(value)
     except ValueError:

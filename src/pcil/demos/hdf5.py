@@ -1,8 +1,9 @@
-"""Numbers out of HDF5 files that anybody may have written: what a file says of its arrays is checked before they are read.
+"""Safe reading of HDF5 files from untrusted sources: the description of every array is checked before its data are read.
 
-The HDF5 library follows a file to other files, to code and out of memory. So here nothing but plain arrays in the file itself
-can be named, and only as many numbers are read as `NUMBERS`. What the library does not see, such as an index that leads back to
-itself, ends the process or never ends; so a file is read in a process of its own, which is this module as a script.
+A malicious file can make the HDF5 library open other files, load filter plugins or run out of memory. Therefore only plain
+arrays that are stored in the file itself are read, and at most `NUMBERS` numbers. Damage that the library does not detect, such
+as a cyclic index, can crash it or make it hang. Therefore `read` does the work in a child process, which runs this module as a
+script.
 """
 
 from __future__ import annotations
@@ -23,35 +24,34 @@ import numpy as np
 
 from pcil import files
 
-_low: Any = h5py  # whose modules of low-level functions have no types
+_low: Any = h5py  # its low-level modules have no type annotations
 h5a, h5d, h5l, h5o, h5s, h5t, h5z = (getattr(_low, f"h5{letter}") for letter in "adlostz")
 
 NUMBERS = 2**29
-"""At most so many numbers are read of a file: 2 GiB in float32."""
+"""The largest number of values that are read from one file: 2 GiB in float32."""
 UNFOLDED = 2**26
-"""So many bytes any file may unfold to; of more, each byte of the file may stand for at most `RATIO`."""
+"""Decompressed bytes that are always allowed; above this, at most `RATIO` times the size of the file."""
 RATIO = 1100
-"""As deflate, the strongest of the `FILTERS`, makes 1 byte of 1032 at most."""
+"""The largest compression ratio: deflate, the strongest of the `FILTERS`, reaches at most 1032."""
 CHUNK = 2**26
-"""Bytes of a chunk of an array, where the whole array is not larger."""
+"""The largest chunk in bytes, unless the whole array is larger."""
 PACKED = 2**21
-"""Bytes of a packed chunk, which may unfold to `RATIO` times as many before its size is known to be wrong."""
+"""The largest compressed chunk in bytes: HDF5 may decompress it to `RATIO` times as many before it notices a wrong size."""
 HEADER = 2**16
-"""Bytes of what describes an array or a group; types can be nested in it."""
+"""The largest object header of an array or a group in bytes; data types can be nested in it."""
 MEMORY = 2**34
-"""Bytes of address space of the process that reads."""
+"""The address space of the child process in bytes."""
 PATIENCE_SECONDS, BYTES_A_SECOND = 12.0, 5e6
-"""How long a file may take, and how much longer for its size."""
+"""The time limit for reading a file: a constant, plus its size divided by a rate."""
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_LZF, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
-"""What arrays may be packed with; the library looks for the code of others in folders of the machine."""
-
+"""The allowed filters; the library would search the machine for plugins that implement other ones."""
 
 Parts = dict[str, list[Any]]
-"""The arrays of an episode: for each of its parts those of the Boxes that it is made of."""
+"""The arrays of an episode by part ("observations", "actions", ...): one array per Box."""
 
 
 class Damage(ValueError):
-    """What is wrong with a file, and in which episode, if in one."""
+    """A file is invalid; `episode` is the index of the invalid episode, or None."""
 
     def __init__(self, text: str, episode: int | None) -> None:
         super().__init__(text)
@@ -59,7 +59,7 @@ class Damage(ValueError):
 
 
 def read(path: Path, wanted: dict[str, Any]) -> list[tuple[int | None, Parts]]:
-    """`episodes`, read in another process; `Damage` too where that crashes or does not end."""
+    """`episodes`, computed in a child process; `Damage` also if that crashes or exceeds its time limit."""
     seconds = PATIENCE_SECONDS + (path.stat().st_size if path.exists() else 0) / BYTES_A_SECOND
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-P", __file__, str(path)]
@@ -81,8 +81,8 @@ def read(path: Path, wanted: dict[str, Any]) -> list[tuple[int | None, Parts]]:
 
 
 def main() -> None:
-    """Answer to `read`: the path is the argument, what is wanted comes in, and episodes or what is wrong go out."""
-    with contextlib.suppress(ImportError, ValueError, OSError):  # not every system has such a limit
+    """The child process of `read`: reads the path from argv and `wanted` from stdin, writes episodes or an error to stdout."""
+    with contextlib.suppress(ImportError, ValueError, OSError):  # not every system has this limit
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
@@ -99,10 +99,10 @@ def main() -> None:
 
 
 def episodes(path: Path, wanted: dict[str, Any]) -> Iterator[tuple[int | None, Parts]]:
-    """The seed and the arrays of each episode of a Minari file; `Damage` where it is not as it must be.
+    """The seed and the arrays of each episode of a Minari file; `Damage` if the file does not match `wanted`.
 
-    `wanted` says how many "episodes" and "steps" there are in all, and of each part of an episode the "boxes", with path and
-    shape of a row. Actions and rewards may be in no episode at all.
+    `wanted` has the total number of "episodes" and "steps", and for each part of an episode its "boxes": the path and the shape
+    of a row. Actions and rewards may be missing from all episodes.
     """
     index = None
     try:
@@ -123,29 +123,29 @@ def episodes(path: Path, wanted: dict[str, Any]) -> Iterator[tuple[int | None, P
             for index in range(count):
                 numbers = {key: [array[()] for array in arrays] for key, arrays in located[index].items()}
                 yield integer(groups[index], "seed"), numbers
-    except Exception as error:  # h5py raises anything on what is damaged
+    except Exception as error:  # damaged files make h5py raise many kinds of exceptions
         raise Damage(str(error) or type(error).__name__, index) from error
 
 
 def _located(group: h5py.Group, boxes: dict[str, Any]) -> Parts:
-    """The arrays of an episode, not read yet; each has the rows that it must have, or `ValueError`."""
+    """The arrays of an episode, without reading their data; `ValueError` if their lengths do not match."""
     if boxes.get("actions", ()) is None:
         raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
     parts = {key: [array(group, path, shape) for path, shape in inner] for key, inner in boxes.items()}
     lengths = {key: {len(array) for array in arrays} or {0} for key, arrays in parts.items()}
     steps = max(lengths["terminations"])
     if not steps or any(length != {steps + (key == "observations")} for key, length in lengths.items()):
-        told = {key: " or ".join(map(str, sorted(length))) for key, length in lengths.items()}
-        told = {"actions": "no", "rewards": "no"} | told
+        counts = {key: " or ".join(map(str, sorted(length))) for key, length in lengths.items()}
+        counts = {"actions": "no", "rewards": "no"} | counts
         given = "{actions} actions with {observations} observations, {rewards} rewards, {terminations} terminations and "
-        given = (given + "{truncations} truncations").format_map(told)
+        given = (given + "{truncations} truncations").format_map(counts)
         raise ValueError(f"T >= 1 actions need T+1 observations and T of the rest, not {given}")
     return parts
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file to read from; `ValueError` where it is none, or a pipe or a device."""
+    """Open an HDF5 file for reading; `ValueError` if it is not a regular HDF5 file."""
     if not path.exists():
         raise ValueError(f"{path.name} is missing")
     files.open_regular(path).close()
@@ -156,12 +156,12 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def has(group: Any, name: str) -> bool:
-    """Whether this is a group that has a member of this name, which may be a link to nowhere."""
+    """Whether `group` is a group with a member of this name, which may be a dangling link."""
     return isinstance(group, h5py.Group) and group.id.links.exists(name.encode())
 
 
 def member(group: h5py.Group, path: str) -> Any:
-    """A group or an array in the same file, named without links; `ValueError` where there is none."""
+    """A group or an array that is reached without soft or external links; `ValueError` if there is none."""
     found: Any = group
     for name in path.split("/"):
         if not has(found, name):
@@ -175,7 +175,7 @@ def member(group: h5py.Group, path: str) -> Any:
 
 
 def array(group: h5py.Group, path: str, shape: list[int]) -> h5py.Dataset:
-    """An array of rows of this shape, not read yet; `ValueError` where it is anything but plain numbers in the file itself."""
+    """An array with rows of this shape, without reading its data; `ValueError` unless it holds plain numbers in this file."""
     found = member(group, path)
     if not isinstance(found, h5py.Dataset):
         raise ValueError(f"{path} is no array")
@@ -206,7 +206,7 @@ def _check_chunks(found: h5py.Dataset, path: str, plan: Any) -> None:
 
 
 def check_size(arrays: Iterable[h5py.Dataset], path: Path) -> None:
-    """`ValueError` where all that is to be read of a file is too much, or more than the file can hold."""
+    """`ValueError` if the arrays are too large, or larger than the file could hold when compressed."""
     arrays = list(arrays)
     if (numbers := sum(math.prod(array.shape) for array in arrays)) > NUMBERS:
         raise ValueError(f"{path.name} holds {numbers:,} numbers, and at most {NUMBERS:,} are read")
@@ -216,7 +216,7 @@ def check_size(arrays: Iterable[h5py.Dataset], path: Path) -> None:
 
 
 def integer(group: h5py.Group, name: str) -> int | None:
-    """An attribute that is a whole number, None where there is none of this name; `ValueError` where it is something else."""
+    """An integer attribute, or None if it is missing; `ValueError` if it has another type."""
     if not h5a.exists(group.id, name.encode()):
         return None
     found = h5a.open(group.id, name.encode())

@@ -1,4 +1,4 @@
-"""Minari datasets: reading ours and anybody's, whatever a damaged or foreign file may hold, and writing. Never a pickle."""
+"""Reading and writing Minari datasets. Files may be damaged or come from anyone; pickles are never loaded."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec, registry
 from jaxtyping import Float
 
+from pcil import envs
+from pcil.demos.arrays import to_unit_box
 from pcil.errors import InputError
 from pcil.files import parse_json, read_json
 from pcil.types import Episode, Origin
 
 PARTS = ("observations", "actions", "rewards", "terminations", "truncations")
-"""Of an episode; others, such as its infos, are never read."""
+"""The arrays of an episode that are read; others, such as its infos, are ignored."""
 SCALAR = {"type": "Box", "shape": []}
 
 
 class Stored(NamedTuple):
-    """What a dataset holds."""
+    """The content of a dataset."""
 
     task: str
     episodes: tuple[Episode, ...]
-    """Absent actions are rows of no numbers, absent rewards are 0."""
+    """Missing actions are arrays of shape `[T, 0]`, and missing rewards are 0."""
     info: dict[str, Any]
     origin: Origin
     has_actions: bool
     has_rewards: bool
     hash: Any
-    """`pcil.demos:Demonstrations.hash` when it was saved; None where that is unknown."""
+    """`pcil.demos:Demonstrations.hash` at the time of saving; None if unknown."""
 
 
 def read(data: Path, *, trusted: bool = False) -> Stored:
-    """A dataset whose data are HDF5, read in a process of its own where it is not `trusted`.
+    """Read a dataset in HDF5; one that is not `trusted` is read in a separate process.
 
-    Actions or rewards are absent where no episode has any: the file lacks them, or all of them are NaN. Minari's own reader is
-    not used: it follows a damaged or foreign file to other files, into crashes, and to whatever environment the file names.
+    Actions or rewards are missing if no episode has them: the file lacks them, or all of them are NaN. Minari's own reader is
+    not used, because a damaged or malicious file can make it crash, open other files, or create any environment.
     """
     from pcil.demos import hdf5
 
@@ -71,7 +73,7 @@ def read(data: Path, *, trusted: bool = False) -> Stored:
         if not has_rewards:
             episodes = [dataclasses.replace(episode, reward=np.zeros(len(episode))) for episode in episodes]
         origin = _checked(Origin(**own["origin"]) if "origin" in own else _origin(metadata, spaces[1]))
-    except Exception as error:  # damaged JSON may make anything raise anything
+    except Exception as error:  # damaged JSON can cause any exception
         if isinstance(error, hdf5.Damage):
             where = str(data) if error.episode is None else f"Episode {error.episode} of {data}"
         raise InputError(f"{where} is not as Minari writes it and can not be read: {reason(error)}.") from error
@@ -79,7 +81,7 @@ def read(data: Path, *, trusted: bool = False) -> Stored:
 
 
 def _boxes(path: str, space: dict[str, Any]) -> Iterator[tuple[str, list[int]]]:
-    """Path and shape of each Box, the parts of Dicts and Tuples in the order that the environment gave them."""
+    """Path and shape of each Box; the entries of Dicts and Tuples are in the order of the environment."""
     if space["type"] in ("Dict", "Tuple"):
         parts = space["subspaces"]
         named = parts.items() if space["type"] == "Dict" else ((f"_index_{i}", part) for i, part in enumerate(parts))
@@ -92,17 +94,17 @@ def _boxes(path: str, space: dict[str, Any]) -> Iterator[tuple[str, list[int]]]:
 
 
 def _origin(metadata: dict[str, Any], action_space: dict[str, Any]) -> Origin:
-    """What a dataset of others, or an older one of ours, tells of its environment."""
+    """What the metadata says about the environment, for datasets without our own `origin` entry."""
     spec = parse_json(metadata.get("env_spec", "{}"))
     known = Origin(spec.get("id"), spec.get("entry_point"), spec.get("kwargs"))
     if any(wrapper["name"] == "RescaleAction" for wrapper in spec.get("additional_wrappers") or ()):
-        return known  # the box that is stored is the wrapper's
+        return known  # the stored box is that of the wrapper
     low, high = (np.ravel(action_space.get(bound, ())).tolist() for bound in ("low", "high"))
     return known._replace(action_low=low or None, action_high=high or None)
 
 
 def _checked(origin: Origin) -> Origin:
-    """`origin`, whose values come from a file; `ValueError` where one is of another kind than it must be."""
+    """`origin`, whose values come from a file; `ValueError` if one has the wrong type."""
     for name, kind in zip(Origin._fields, (str, str, dict, list, list, float | int), strict=True):
         value = getattr(origin, name)
         if value is not None and not isinstance(value, kind):
@@ -112,7 +114,7 @@ def _checked(origin: Origin) -> Origin:
 
 
 def _episode(arrays: dict[str, list[Any]], seed: int | None, action_space: dict) -> Episode:
-    """One episode out of its arrays; the action space is the metadata's, in JSON. `ValueError` if ill-formed."""
+    """Build an episode from its arrays and the action space in the metadata's JSON; `ValueError` if they are invalid."""
     parts = [array.reshape(len(array), -1) for array in arrays["observations"] if 0 not in array.shape]
     if not parts:
         raise ValueError("its observations are rows of no numbers")
@@ -120,13 +122,13 @@ def _episode(arrays: dict[str, list[Any]], seed: int | None, action_space: dict)
     action = _unit_actions(arrays["actions"][0], action_space) if "actions" in arrays else np.zeros((len(ends), 0))
     reward = arrays["rewards"][0] if "rewards" in arrays else np.full(len(ends), np.nan)
     reward = reward.astype("f4" if reward.dtype == np.float32 else "f8")
-    with np.errstate(over="ignore"):  # what is too large becomes infinite here, and is refused as such
+    with np.errstate(over="ignore"):  # values too large for float32 become infinite and are refused later
         obs = np.concatenate([part.astype(np.float32) for part in parts], axis=1)
         return Episode(obs, action.astype(np.float32), reward, bool(ends[-1]), seed)
 
 
 def _unit_actions(stored: np.ndarray, space: dict[str, Any]) -> Float[np.ndarray, "T action"]:
-    """Actions brought from their box to [-1, 1]; rows of no numbers where all are NaN, which is how absent ones are stored."""
+    """Actions rescaled from their box to [-1, 1]; of shape `[T, 0]` if all are NaN, which is how missing actions are stored."""
     if stored.dtype.kind == "f" and stored.size and np.isnan(stored).all():
         return np.zeros((len(stored), 0))
     low, high = (np.ravel(space.get(bound, np.nan)).astype(np.float64) for bound in ("low", "high"))
@@ -134,11 +136,11 @@ def _unit_actions(stored: np.ndarray, space: dict[str, Any]) -> Float[np.ndarray
         raise ValueError("only actions of a Box with finite bounds can be brought to [-1, 1]")
     if not low.size:
         raise ValueError("its actions are rows of no numbers")
-    return (stored.reshape(len(stored), -1).astype(np.float64) - (high + low) / 2) / ((high - low) / 2)
+    return to_unit_box(stored.reshape(len(stored), -1).astype(np.float64), low, high)
 
 
 def write(data: Path, dataset_id: str, kept: Stored) -> None:
-    """Write `metadata.json` and `main_data.hdf5` into the new folder `data`, by Minari's own hand; what is absent is NaN."""
+    """Write `metadata.json` and `main_data.hdf5` into the new folder `data` with Minari's writer; NaN for missing arrays."""
     import minari
     from minari.data_collector import EpisodeBuffer
     from minari.dataset.minari_storage import MinariStorage
@@ -169,14 +171,14 @@ def write(data: Path, dataset_id: str, kept: Stored) -> None:
 
 
 def _env_spec(task: str, origin: Origin) -> EnvSpec | None:
-    """What Gymnasium has registered for `task`, with the arguments of the origin and with the wrappers that make it flat and
-    its actions [-1, 1]."""
+    """The spec that is registered for `task`, with the keyword arguments of `origin` and with the wrappers that flatten
+    observations and rescale actions to [-1, 1]."""
     known = next((registry[name] for name in (f"dmc/{task}-v0", task.rpartition(":")[2]) if name in registry), None)
     if known is None or not isinstance(known.entry_point, str):
         return None
     if origin.env_id == known.id:
         known = dataclasses.replace(known, kwargs=known.kwargs | (origin.kwargs or {}))
-    if known.namespace in ("dmc", "toy"):  # these are so by themselves
+    if known.namespace in envs.SUITES:  # these have flat observations and actions in [-1, 1] already
         return known
     flatten = gymnasium.wrappers.FlattenObservation.wrapper_spec()
     rescale = gymnasium.wrappers.RescaleAction.wrapper_spec(min_action=-1.0, max_action=1.0)
@@ -184,12 +186,12 @@ def _env_spec(task: str, origin: Origin) -> EnvSpec | None:
 
 
 def task_of(name: str) -> str:
-    """The task that "dmc/<task>-v0" (an environment) or "dmc/<task>/expert-v0" (a dataset) names; else `name`."""
+    """The task in "dmc/<task>-v0" (an environment) or "dmc/<task>/expert-v0" (a dataset); other names are unchanged."""
     return re.sub(r"\Admc/(\w+?)(/expert)?-v0\Z", r"\1", name)
 
 
 def reason(error: Exception) -> str:
-    """What a library said, without line breaks and full stops, to go into a sentence of ours."""
+    """The message of an exception, without line breaks and full stops, for use inside a sentence."""
     text = str(error.args[0] if isinstance(error, KeyError) else error).strip() or type(error).__name__
     text = f"there is no {text!r}" if isinstance(error, KeyError) and " " not in text else text
     return re.sub(r"[.!?]?\s*\n.*|[.!?]$", "", text, flags=re.DOTALL).replace(". ", "; ")

@@ -1,4 +1,4 @@
-"""Environments by name: `make("walker_walk")` or any Gymnasium id, always with flat float32 boxes."""
+"""Environments by name: `make("walker_walk")` or any Gymnasium id, always with flat float32 Boxes as spaces."""
 
 from __future__ import annotations
 
@@ -34,32 +34,35 @@ TASKS = (
 """The ten tasks of the paper (Appendix A), all from DeepMind Control."""
 
 LONGEST_EPISODE = 100_000
-"""Steps after which an environment without a time limit is taken to have no end."""
+"""The number of steps after which an episode without a time limit is considered endless."""
 
 _GIVEN = ("object ", "function ")
-"""How the names begin of environments that were given in Python: as they are, or by a function."""
+"""The prefixes of the names of environments that were passed from Python, as an object or as a function."""
 
-_TOYS = {
-    "toy/point_mass-v0": "PointMass",
-    "toy/reach-v0": "Reach",
-    "toy/probe_1-v0": "ConstantReward",
-    "toy/probe_2-v0": "ObservedReward",
-    "toy/probe_3-v0": "DelayedReward",
-    "toy/probe_4-v0": "ActionReward",
-    "toy/probe_5-v0": "ObservedActionReward",
+SUITES: dict[str, dict[str, tuple[str, dict[str, Any]]]] = {
+    "dmc": {task: ("pcil.envs.dmc:DMCEnv", {"task": task}) for task in TASKS},
+    "toy": {
+        "point_mass": ("pcil.envs.toy:PointMass", {}),
+        "reach": ("pcil.envs.toy:Reach", {}),
+        "probe_1": ("pcil.envs.toy:ConstantReward", {}),
+        "probe_2": ("pcil.envs.toy:ObservedReward", {}),
+        "probe_3": ("pcil.envs.toy:DelayedReward", {}),
+        "probe_4": ("pcil.envs.toy:ActionReward", {}),
+        "probe_5": ("pcil.envs.toy:ObservedActionReward", {}),
+    },
 }
+"""The environments of this package: entry point and keyword arguments of `<suite>/<name>-v0`, by suite and by name."""
 
 
 def register() -> None:
-    """Registers `dmc/<task>-v0` for the ten tasks and the toy environments with Gymnasium; again is harmless."""
-    for task in TASKS:
-        _register(dmc_id(task), "pcil.envs.dmc:DMCEnv", task=task)
-    for toy_id, name in _TOYS.items():
-        _register(toy_id, f"pcil.envs.toy:{name}")
+    """Register the environments of `SUITES` with Gymnasium; those that are registered already stay as they are."""
+    for suite, environments in SUITES.items():
+        for name, (entry_point, kwargs) in environments.items():
+            _register(f"{suite}/{name}-v0", entry_point, **kwargs)
 
 
-def _register(env_id: str, entry_point: str, **kwargs: str) -> None:
-    """Registers one environment so that `gymnasium.make` wraps nothing around it."""
+def _register(env_id: str, entry_point: str, **kwargs: Any) -> None:
+    """Register one environment so that `gymnasium.make` adds no wrappers."""
     if env_id not in gymnasium.registry:
         gymnasium.register(env_id, entry_point, kwargs=kwargs, disable_env_checker=True, order_enforce=False)
 
@@ -70,9 +73,9 @@ def dmc_id(task: str) -> str:
 
 
 def task_name(task: Any) -> str:
-    """The short name under which results are kept: "walker_walk" for "dmc/walker_walk-v0", other ids as they are.
+    """The short name of a task in results: "walker_walk" for "dmc/walker_walk-v0"; other ids are returned unchanged.
 
-    Of a function that makes an environment, or of an environment, it says which it is; `make` takes no such name.
+    For an environment, or a function that creates one, the name says so; `make` does not accept such a name.
     """
     if isinstance(task, str):
         return task.removeprefix("dmc/").removesuffix("-v0") if task.startswith("dmc/") else task
@@ -85,18 +88,18 @@ def task_name(task: Any) -> str:
 
 
 def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Checked:
-    """The environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
+    """Create the environment of a task, with a flat float32 `Box` observation and a float32 `Box(-1, 1)` action.
 
-    `task` is a task of DeepMind Control's suite ("walker_walk" or "dmc/walker_walk-v0"), one of our toys
-    ("toy/point_mass-v0"), any Gymnasium id, a function that makes an environment, or an environment. `env_kwargs` are keyword
-    arguments of the environment, given to `gymnasium.make` or to the function. Observations are Boxes, or Dicts and Tuples of
-    Boxes: these are flattened, actions are rescaled, and all that comes back is checked (`pcil.envs.checked:Checked`).
+    `task` is a task of the DeepMind Control suite ("walker_walk" or "dmc/walker_walk-v0"), a toy ("toy/point_mass-v0"), any
+    Gymnasium id, a function that creates an environment, or an environment. `env_kwargs` are passed to `gymnasium.make` or to
+    the function. The environment's observations may be Boxes, or Dicts and Tuples of Boxes. They are flattened, actions are
+    rescaled, and all return values are checked (`pcil.envs.checked:Checked`).
     """
     env = task if isinstance(task, gymnasium.Env) else _made(task, render_mode, env_kwargs)
     if isinstance(env, Checked):
         return env
     registered = env.spec
-    own = registered is not None and registered.namespace in ("dmc", "toy")
+    own = registered is not None and registered.namespace in SUITES
     limited = own or (registered is not None and registered.max_episode_steps is not None)
     try:
         return Checked(_flat_actions(env, task_name(task)), task_name(task), None if limited else LONGEST_EPISODE)
@@ -110,7 +113,7 @@ def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any
 
 @contextlib.contextmanager
 def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any] | None = None) -> Iterator[Checked]:
-    """The environment that `make` gives, closed at the end; one that was given as an object is its owner's to close."""
+    """`make` as a context manager that closes the environment, unless it was passed as an object: then its owner closes it."""
     env = make(task, render_mode, env_kwargs=env_kwargs)
     try:
         yield env
@@ -120,7 +123,7 @@ def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, A
 
 
 def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None) -> gymnasium.Env:
-    """The environment as Gymnasium or a function makes it."""
+    """The environment as Gymnasium or the user's function creates it."""
     if not isinstance(task, str):
         return _returned(task, env_kwargs or {})
     if task.startswith(_GIVEN):
@@ -128,7 +131,7 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
     register()
     arguments = json_object("env_kwargs", env_kwargs or {})
     env_id = _gymnasium_id(task)
-    if render_mode is not None and env_id in _TOYS:
+    if render_mode is not None and env_id.startswith("toy/"):
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
     if "task" in arguments and env_id.startswith("dmc/"):
         raise InputError(f"env_kwargs has the task {arguments['task']!r}; the task is {task!r}, and arguments can't change it.")
@@ -144,13 +147,13 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
         if env_id.rpartition(":")[2] not in gymnasium.registry:
             _refuse_name(task, error)
         raise InputError(f"Gymnasium cannot make {task!r}: {error}") from error
-    except Exception as error:  # the environment may be a person's own and may raise anything
+    except Exception as error:  # the environment may be a user's own and may raise anything
         given = f" with {json.dumps(env_kwargs)}" if env_kwargs else ""
         raise InputError(f"The environment {task!r} can't be made{given} ({type(error).__name__}: {error}).") from error
 
 
 def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
-    """The environment that a function makes."""
+    """The environment that the user's function creates."""
     name = task_name(function)
     try:
         env = function(**env_kwargs)
@@ -164,21 +167,20 @@ def _returned(function: Any, env_kwargs: dict[str, Any]) -> gymnasium.Env:
 
 
 def spec(env: gymnasium.Env) -> Spec:
-    """The sizes of a made environment, and how many control steps (frames) one of its steps takes."""
-    from pcil.envs.dmc import DMCEnv
-
+    """The sizes of an environment that `make` has created, and its number of control steps (frames) per step."""
     inner = env.unwrapped
-    action_repeat = inner.action_repeat if isinstance(inner, DMCEnv) else 1
+    ours = any(kind.__module__.startswith("pcil.envs.") for kind in type(inner).__mro__)
+    action_repeat = getattr(inner, "action_repeat", 1) if ours else 1
     return Spec(spaces.flatdim(env.observation_space), spaces.flatdim(env.action_space), action_repeat)
 
 
 def ends_early(env: gymnasium.Env) -> bool:
-    """Whether an episode may terminate: it is taken to, unless the environment has an attribute `ends_early` that is False."""
+    """Whether an episode may terminate: True unless the environment has an attribute `ends_early` that is False."""
     return bool(getattr(env.unwrapped, "ends_early", True))
 
 
 def origin(env: gymnasium.Env) -> Origin:
-    """What demonstrations recorded in `env` are to know of it."""
+    """The description of `env` that is stored with demonstrations recorded in it."""
     inner, outer = env.unwrapped, env
     while isinstance(outer, gymnasium.Wrapper) and not isinstance(outer, _RescaleAction):
         outer = outer.env
@@ -194,7 +196,7 @@ def origin(env: gymnasium.Env) -> Origin:
 
 
 def known_arguments(kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Those of an environment's keyword arguments that JSON can hold, without the way it is rendered."""
+    """The keyword arguments that JSON can represent, without `render_mode`."""
     known = {}
     for name, value in kwargs.items():
         with contextlib.suppress(InputError):
@@ -203,11 +205,11 @@ def known_arguments(kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 class _RescaleAction(wrappers.RescaleAction):
-    """Ours, in contrast to one that the environment is registered with."""
+    """A class of its own, to tell our wrapper from one that the environment was registered with."""
 
 
 def _gymnasium_id(task: str) -> str:
-    """The registered id for a name; registers a task of the suite that is not among the ten on demand."""
+    """The registered id for a name. Tasks of the DeepMind Control suite beyond the ten are registered on demand."""
     name = task_name(task)
     if dmc_id(name) in gymnasium.registry:
         return dmc_id(name)
@@ -218,7 +220,7 @@ def _gymnasium_id(task: str) -> str:
 
 
 def _suite_tasks() -> list[str]:
-    """Every task of DeepMind Control's suite by name, none where it is not installed; the import takes half a second."""
+    """The names of all tasks of the DeepMind Control suite; none if it is not installed. The import takes half a second."""
     from pcil.envs.dmc import import_suite
 
     try:

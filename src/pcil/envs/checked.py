@@ -1,4 +1,4 @@
-"""What an environment returns, checked once for all: training, evaluation, recording and films step this wrapper alone."""
+"""A wrapper that checks everything an environment returns; training, evaluation, recording and films all step this wrapper."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 class Checked(gymnasium.Wrapper):
-    """An environment whose observations are flat, finite float32 vectors, its rewards floats and its ends plain bools.
+    """An environment with flat, finite float32 observations, float rewards, and termination and truncation of type bool.
 
-    Dicts and Tuples of Boxes, nested ones too, are flattened in the order of `gymnasium.spaces.flatten`. `InputError` says
-    where the environment returns anything else than its spaces and Gymnasium's interface promise; `RunError` where it raises,
-    or where an observation, a reward or an action is not finite in float32. Values outside the bounds of a Box are fine.
+    Dicts and Tuples of Boxes, also nested ones, are flattened in the order of `gymnasium.spaces.flatten`. `InputError` is
+    raised if the environment violates its spaces or Gymnasium's interface, and `RunError` if it raises an exception, or if an
+    observation, a reward or an action is not finite in float32. Values outside the bounds of a Box are accepted.
     """
 
     episode: str | None = None
-    """What the episode is called in errors; set before `reset`, for here episodes are only counted."""
+    """The name of the next episode in error messages; set it before `reset`. By default episodes are numbered."""
 
     def __init__(self, env: gymnasium.Env, name: str, longest: int | None = None) -> None:
-        """`name` stands in errors; an episode of more than `longest` steps is taken to have no end and is refused."""
+        """`name` is used in error messages; an episode of more than `longest` steps is refused as endless."""
         super().__init__(env)
         space = env.observation_space
         if not _is_of_boxes(space) or not spaces.flatdim(space):
@@ -40,7 +40,7 @@ class Checked(gymnasium.Wrapper):
             )
         flat: Any = spaces.flatten_space(space)
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*precision lowered by casting")  # to float32, which is what we are here for
+            warnings.filterwarnings("ignore", ".*precision lowered by casting")  # the cast to float32 is intended
             self.observation_space = spaces.Box(flat.low, flat.high, flat.shape, np.float32)
         self._name, self._longest, self._inner_space = name, longest, space
         self._shape = space.shape if isinstance(space, spaces.Box) and len(space.shape) == 1 else None
@@ -49,7 +49,7 @@ class Checked(gymnasium.Wrapper):
 
     @property
     def spec(self) -> Any:
-        """That of the environment: checks are no part of it."""
+        """The spec of the wrapped environment; this wrapper does not add itself to it."""
         return self.env.spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -58,7 +58,7 @@ class Checked(gymnasium.Wrapper):
             result = self.env.reset(seed=seed, options=options)
         except InputError:
             raise
-        except (Exception, SystemExit) as error:  # the environment is anybody's
+        except (Exception, SystemExit) as error:  # a user's environment may raise anything
             if isinstance(error, TypeError) and re.search("unexpected keyword argument '(seed|options)'", str(error)):
                 raise InputError(
                     f"The environment {self._name!r} can't be reset with a seed ({error}); its reset must take the keywords "
@@ -99,10 +99,14 @@ class Checked(gymnasium.Wrapper):
             terminated = self._flag(terminated, "termination")
         if type(truncated) is not bool:
             truncated = self._flag(truncated, "truncation")
+        if type(info) is not dict:
+            if not isinstance(info, Mapping | None):
+                raise self._refused(info, "as info", "a dict")
+            info = dict(info or {})
         return row, reward, terminated, truncated, info
 
     def close(self) -> None:
-        """Closes the environment; one that can't be closed has done its work all the same, so this only warns."""
+        """Close the environment. An exception is only reported as a warning, since the results are complete by then."""
         try:
             self.env.close()
         except Exception as error:
@@ -110,7 +114,7 @@ class Checked(gymnasium.Wrapper):
 
     def _observation(self, obs: Any) -> np.ndarray:
         """A flat float32 copy: the environment may reuse its buffer."""
-        with np.errstate(over="ignore"):  # what is too large for float32 becomes infinite here, and is refused as such
+        with np.errstate(over="ignore"):  # values too large for float32 become infinite and are refused below
             parts = [part.ravel().astype(np.float32) for _, part in self._parts(self._inner_space, obs, "observation")]
             row = np.concatenate(parts)
             if np.isfinite(row).all():
@@ -118,10 +122,10 @@ class Checked(gymnasium.Wrapper):
             for path, part in self._parts(self._inner_space, obs, "observation"):
                 if where := np.argwhere(~np.isfinite(part.astype(np.float32))).tolist():
                     raise self._not_finite(part[tuple(where[0])], f"returned an {path} whose {_entry(where[0])}")
-        raise AssertionError("a part of what is not finite is not finite")
+        raise AssertionError("one of the parts must have a value that is not finite")
 
     def _parts(self, space: spaces.Space, value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
-        """The array of each Box in a space, with the path to it, in the order in which Gymnasium flattens them."""
+        """The path and the array of each Box in a space, in Gymnasium's flattening order."""
         if isinstance(space, spaces.Dict):
             if not isinstance(value, Mapping):
                 raise self._refused(value, f"as {path}", f"a dict with the keys {_listed(space.spaces)}")
@@ -135,13 +139,13 @@ class Checked(gymnasium.Wrapper):
             for i, inner in enumerate(space.spaces):
                 yield from self._parts(inner, value[i], f"{path}[{i}]")
         else:
-            array = _numbers(value)
+            array = real_numbers(value)
             if array is None or array.shape != space.shape:
                 raise self._refused(value, f"as {path}", f"real numbers of shape {space.shape}, as its space says")
             yield path, array
 
     def _reward(self, reward: Any) -> float:
-        array = _numbers(reward)
+        array = real_numbers(reward)
         if array is None or array.size != 1:
             raise self._refused(reward, "as reward", "a number")
         number = float(array.item())
@@ -150,14 +154,14 @@ class Checked(gymnasium.Wrapper):
         return number
 
     def _flag(self, value: Any, what: str) -> bool:
-        array = _numbers(value)
+        array = real_numbers(value)
         if array is None or array.size != 1 or array.dtype.kind == "f" or array.item() not in (0, 1):
             raise self._refused(value, f"as {what}", "True or False")
         return bool(array.item())
 
     def checked_action(self, action: Any) -> np.ndarray:
-        """An action for the next step; `InputError` if it is of another shape or no numbers, `RunError` if it is not finite."""
-        array = _numbers(action)
+        """The action as an array; `InputError` if it has another shape or is not numeric, `RunError` if it is not finite."""
+        array = real_numbers(action)
         if array is None or array.shape != self._action_shape:
             raise InputError(
                 f"The action for {self._name!r} is {brief(action)}, {self._place(1)}; it must be real numbers of shape "
@@ -169,14 +173,14 @@ class Checked(gymnasium.Wrapper):
         return array
 
     def _place(self, ahead: int = 0) -> str:
-        """Where in which episode; the step that comes next with `ahead` 1."""
+        """The step and the episode, for error messages; with `ahead` 1 the next step."""
         step = self._steps + ahead
         seed = "" if self._seed is None else f" (seed {self._seed})"
         return f"{f'in step {step}' if step else 'at the start'} of {self.episode or f'episode {self._episodes}'}{seed}"
 
     def _refused(self, value: Any, how: str, expected: str) -> InputError:
-        said = f"{len(value)} values" if how.startswith("from") and isinstance(value, (tuple, list)) else brief(value)
-        return InputError(f"The environment {self._name!r} returned {said} {how}, {self._place()}; it must be {expected}.")
+        given = f"{len(value)} values" if how.startswith("from") and isinstance(value, (tuple, list)) else brief(value)
+        return InputError(f"The environment {self._name!r} returned {given} {how}, {self._place()}; it must be {expected}.")
 
     def _not_finite(self, value: Any, whose: str, ahead: int = 0) -> RunError:
         wide = ", too large for float32" if np.isfinite(value) else ""
@@ -187,7 +191,7 @@ class Checked(gymnasium.Wrapper):
 
 
 def checked(env: gymnasium.Env) -> Checked:
-    """An environment with its returns checked; one that has this already as it is."""
+    """The environment wrapped in `Checked`, unless it is already."""
     return env if isinstance(env, Checked) else Checked(env, env.spec.id if env.spec else type(env.unwrapped).__name__)
 
 
@@ -208,11 +212,11 @@ def _is_of_boxes(space: Any) -> bool:
     return isinstance(space, spaces.Box)
 
 
-def _numbers(value: Any) -> np.ndarray | None:
-    """An array of real numbers or bools; None for everything else, and where entries are masked."""
+def real_numbers(value: Any) -> np.ndarray | None:
+    """The value as an array of real numbers or bools; None for everything else, and if entries are masked."""
     try:
         array = np.asarray(value)
-    except Exception:  # such as lists of different lengths, or an array on a device that NumPy can't read
+    except Exception:  # such as ragged lists, or an array on a GPU
         return None
     return None if array.dtype.kind not in "fiub" or np.ma.is_masked(value) else array
 
@@ -226,13 +230,13 @@ def _listed(keys: Any) -> str:
 
 
 def _said(error: BaseException) -> str:
-    """Type and message of an error, on one line."""
+    """The type and the message of an exception on one line."""
     text = " ".join(str(error).split()).removesuffix(".")
     return f"{type(error).__name__} ({text})" if text else type(error).__name__
 
 
 def _raised_in_gymnasium(error: BaseException) -> bool:
-    """Whether a wrapper of Gymnasium's raised it, rather than the environment that it wraps."""
+    """Whether the exception was raised by a wrapper of Gymnasium's, not by the environment inside."""
     trace = error.__traceback__
     while trace and trace.tb_next:
         trace = trace.tb_next

@@ -1,7 +1,7 @@
-"""Any task of DeepMind Control's suite as a `gymnasium.Env`, bit for bit equal to `dm_control` and much faster to step.
+"""Any task of the DeepMind Control suite as a `gymnasium.Env`, equal to `dm_control` bit for bit and much faster to step.
 
-Physics and task are dm_control's own objects. What is ours is the loop around them: dm_control's order of operations
-without its time steps, named indexing and dictionaries, and the observation built once for each agent step.
+Physics and task are dm_control's own objects. Only the loop around them is ours. It has dm_control's order of operations, but
+no TimeStep objects, no lookups by name and no dictionaries, and it builds the observation once per agent step.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _RENDERERS = {
 class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One task of the suite with flat float32 observations and actions in [-1, 1].
 
-    The observation holds dm_control's entries, concatenated in dm_control's order. An action is held for
-    `action_repeat` control steps (frames) and their rewards are summed in float64; an episode that ends earlier ends
-    there. A time limit truncates; only a task that ends with discount 0 terminates. `info["frames"]` counts the control
-    steps of the episode.
+    The observation is the concatenation of dm_control's entries in their order. An action is repeated for
+    `action_repeat` control steps (frames), or fewer at the end of an episode, and their rewards are summed in float64. A time
+    limit truncates the episode; only an end with discount 0 terminates it. `info["frames"]` is the number of control steps in
+    the episode so far.
 
-    Nothing here catches or hides a `dm_control.rl.control.PhysicsError`: a diverged simulation stops the run.
+    A `dm_control.rl.control.PhysicsError` is not caught: a diverged simulation ends the run.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  as gymnasium.Env declares it
@@ -56,7 +56,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, "rgb_array"):
             raise InputError(f'render_mode is None or "rgb_array" for DeepMind Control; got {render_mode!r}.')
         suite = import_suite()
-        if render_mode is not None or task == "quadruped_escape":  # which hands its terrain to OpenGL at each reset
+        if render_mode is not None or task == "quadruped_escape":  # it uploads its terrain to OpenGL at each reset
             enable_rendering()
         self.name = task
         self._domain, self._task = split_name(task, suite.ALL_TASKS)
@@ -65,25 +65,25 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._camera = {"height": height, "width": width, "camera_id": camera_id}
         random = np.random.RandomState(0)
         self._load(random)
-        # lqr draws its springs while it is loaded, so that there each episode needs a model of its own.
+        # The lqr tasks draw spring constants while they are loaded, so each episode needs a new model.
         self._random_model = random.bytes(16) != np.random.RandomState(0).bytes(16)
         self._define_spaces()
         self._frames, self._over = 0, True
 
     @property
     def dt(self) -> float:
-        """Simulated seconds of one step."""
+        """The simulated duration of one step in seconds."""
         return self._env.control_timestep() * self.action_repeat
 
     @property
     def physics(self) -> Any:
-        """The `dm_control.mujoco.Physics` that is stepped: states, bodies, cameras."""
+        """The `dm_control.mujoco.Physics` of the simulation."""
         return self._env.physics
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts the episode that a fresh `suite.load(..., task_kwargs={"random": seed})` would start with.
+        """Start the episode with which a new `suite.load(..., task_kwargs={"random": seed})` would start.
 
-        Without a seed, one is drawn from `np_random`.
+        The default seed is drawn from `np_random`.
         """
         del options
         super().reset(seed=seed)
@@ -99,7 +99,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Holds one action for `action_repeat` control steps or until the episode ends."""
+        """Repeat one action for `action_repeat` control steps or until the episode ends."""
         if self._over:
             raise gymnasium.error.ResetNeeded("The episode is over or never began: call reset() before step().")
         control = self.control_signal(action)
@@ -122,24 +122,24 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._action_low + self._action_scale * (action + 1.0) if self._rescale else action
 
     def render(self) -> np.ndarray | None:
-        """What the camera sees now, `[height, width, 3]` uint8."""
+        """The current image of the camera, `[height, width, 3]` uint8."""
         return None if self.render_mode is None else self.physics.render(**self._camera)
 
     def close(self) -> None:
-        """Frees the rendering contexts; the simulation needs no closing."""
+        """Free the rendering contexts; the simulation itself need not be closed."""
         if self.render_mode is not None:
             self.physics.free()
 
     def _load(self, random: np.random.RandomState) -> None:
-        """Loads model and task and prepares what a step calls."""
+        """Load model and task, and prepare the functions that `step` calls."""
         from dm_control.rl import control
 
-        with _model_warnings_unsaid():
+        with _model_warnings_suppressed():
             self._env = env = import_suite().load(self._domain, self._task, task_kwargs={"random": random})
-        self.num_substeps: int = env._n_sub_steps  # dm_control shows this and the limit nowhere else
+        self.num_substeps: int = env._n_sub_steps  # dm_control has no public attribute for this and the limit
         self._frame_limit: float = env._step_limit
         self._fill_observation, self._reward = (views_for(self.name) or generic_views)(env)
-        inherited = type(env.task).get_termination is control.Task.get_termination  # which is: never
+        inherited = type(env.task).get_termination is control.Task.get_termination  # it never terminates
         self._termination = None if inherited else env.task.get_termination
         self.ends_early = not inherited
 
@@ -148,7 +148,7 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         bounds = self._env.action_spec()
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (self._obs_dim,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, bounds.shape, np.float32)
-        # As dm_control's action_scale.Wrapper(env, -1, 1) has it; where the bounds are [-1, 1] nothing is to be scaled.
+        # The same as dm_control's action_scale.Wrapper(env, -1, 1); bounds of [-1, 1] need no scaling.
         self._action_low, self._action_scale = bounds.minimum, (bounds.maximum - bounds.minimum) / 2.0
         self._rescale = bool(np.any(bounds.minimum != -1.0) or np.any(bounds.maximum != 1.0))
         self.metadata = {**DMCEnv.metadata, "render_fps": round(1.0 / self.dt)}
@@ -160,19 +160,19 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 def checked_action(action: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The action in float64, refused if it has another shape or an entry that is NaN or outside [-1, 1]."""
+    """The action in float64; `ValueError` if it has another shape, or an entry that is NaN or outside [-1, 1]."""
     action = np.asarray(action, dtype=np.float64)
     if action.shape != shape:
         raise ValueError(f"An action of shape {shape} was expected; got shape {action.shape}.")
-    for value in action.tolist():  # for a few numbers faster than NumPy; a NaN fails the comparison
+    for value in action.tolist():  # faster than NumPy for a few numbers; NaN fails the comparison
         if not -1.0 <= value <= 1.0:
             raise ValueError(f"Every entry of an action must lie in [-1, 1]; got {value!r}.")
     return action
 
 
 @contextlib.contextmanager
-def _model_warnings_unsaid() -> Iterator[None]:
-    """MuJoCo calls some of dm_control's own model files deprecated, each time one is loaded; no user can change them."""
+def _model_warnings_suppressed() -> Iterator[None]:
+    """Suppress MuJoCo's deprecation warnings about dm_control's own model files, which users can't change."""
     logger = logging.getLogger("absl")
     before = logger.level
     logger.setLevel(logging.ERROR)
@@ -183,10 +183,10 @@ def _model_warnings_unsaid() -> Iterator[None]:
 
 
 def import_suite() -> ModuleType:
-    """`dm_control.suite`, imported so that a machine without OpenGL is no hindrance; `InputError` where it is not installed.
+    """Import `dm_control.suite`, also on machines without OpenGL; `InputError` if it is not installed.
 
-    Unless `MUJOCO_GL` says otherwise, dm_control looks for a window system while it is imported. We keep it from that
-    for the length of the import; `enable_rendering` brings OpenGL in when someone asks for pictures.
+    Unless `MUJOCO_GL` is set, dm_control looks for a window system while it is imported. This is disabled during the import;
+    `enable_rendering` loads OpenGL when images are needed.
     """
     chosen = os.environ.get("MUJOCO_GL")
     if chosen is None:
@@ -208,7 +208,7 @@ def import_suite() -> ModuleType:
 
 
 def enable_rendering() -> None:
-    """Gives dm_control a renderer that needs no display: the one that `MUJOCO_GL` names, else EGL, else OSMesa."""
+    """Set dm_control's renderer to the one that `MUJOCO_GL` names, else to EGL or OSMesa, which need no display."""
     render: Any = importlib.import_module("dm_control._render")
     name = os.environ.get("MUJOCO_GL", "").lower()
     if not name:
@@ -230,7 +230,7 @@ def _no_opengl(name: str) -> InputError:
 
 
 def split_name(task: str, all_tasks: tuple[tuple[str, str], ...]) -> tuple[str, str]:
-    """`("ball_in_cup", "catch")` for "ball_in_cup_catch": names of domains and of tasks may hold underscores."""
+    """`("ball_in_cup", "catch")` for "ball_in_cup_catch"; domains and tasks may both have underscores in their names."""
     for domain, name in all_tasks:
         if task == f"{domain}_{name}":
             return domain, name
@@ -238,17 +238,17 @@ def split_name(task: str, all_tasks: tuple[tuple[str, str], ...]) -> tuple[str, 
 
 
 def advance_function(physics: Any, task: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
-    """One control step: set the control signal, then the substeps in dm_control's order.
+    """A function for one control step: set the control signal, then do the substeps in dm_control's order.
 
-    Made anew for each episode, whose beginning tells which of MuJoCo's warnings are new. A task that does more than
-    that in a step is left to its own methods.
+    It is created for each episode, because it compares MuJoCo's warning counts with those at the start of the episode. Tasks
+    with their own `before_step`, `after_step` or physics are stepped through these methods.
     """
     from dm_control.mujoco import engine
     from dm_control.suite import base
 
     plain = (
         type(task).before_step is base.Task.before_step
-        and type(task).after_step is base.Task.after_step  # recolours bodies if `visualize_reward`, which is off
+        and type(task).after_step is base.Task.after_step  # it only recolours bodies if `visualize_reward` is on
         and type(physics).step is engine.Physics.step
         and type(physics).set_control is engine.Physics.set_control
         and physics.legacy_step
@@ -279,7 +279,7 @@ def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], No
             mj_step2(model, data)
             if num_substeps > 1:
                 mj_step(model, data, num_substeps - 1)
-        mj_step1(model, data)  # so that positions and velocities are those of the new state
+        mj_step1(model, data)  # updates positions and velocities to the new state
         if warnings.tobytes() != before:
             _raise_physics_error(warnings > np.frombuffer(before, warnings.dtype))
 
@@ -287,7 +287,7 @@ def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], No
 
 
 def _raise_physics_error(raised: np.ndarray) -> None:
-    """Raises dm_control's error if one of MuJoCo's warnings came up."""
+    """Raise dm_control's error if MuJoCo issued a warning."""
     from dm_control.rl import control
 
     mujoco: Any = importlib.import_module("mujoco")
@@ -296,7 +296,7 @@ def _raise_physics_error(raised: np.ndarray) -> None:
 
 
 def generic_views(env: Any) -> Views:
-    """Observation and reward through the task's own methods, for any task."""
+    """Observation and reward from the task's own methods, for any task."""
     physics, task = env.physics, env.task
 
     def fill_observation(row: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Episodes, in one environment or in several side by side; acting, and what else happens between steps, is the caller's."""
+"""Episodes in one or several environments. The caller chooses the actions and does whatever else happens between steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pcil.types import Episode
 
 
 class Rollout:
-    """One episode in each of some environments, stepped together until the last has ended.
+    """One episode in each of several environments, which are stepped together until all episodes have ended.
 
     rollout = Rollout([env], [seed], ["recorded episode 1"])
     while rollout.playing:
@@ -23,8 +23,8 @@ class Rollout:
     def __init__(
         self, environments: Sequence[Checked], seeds: Sequence[int], names: Sequence[str], *, keep: bool = True
     ) -> None:
-        """Reset each environment with its seed; its name is what errors call the episode. `keep` says whether `episodes` is to
-        have its steps."""
+        """Reset each environment with its seed; `names` are the names of the episodes in error messages. `episodes` needs
+        `keep`, which stores every step."""
         self._environments = list(environments)
         self._seeds, first = list(seeds), []
         for env, seed, name in zip(environments, seeds, names, strict=True):
@@ -33,16 +33,16 @@ class Rollout:
         self._steps: list[list[tuple[np.ndarray, Any, float]]] = [[] for _ in first]
         self._terminated, self._keep = [False] * len(first), keep
         self.returns, self.lengths = np.zeros(len(first)), np.zeros(len(first), np.int64)
-        """The sum of each episode's rewards until here, and how many steps it has."""
+        """The return and the length of each episode so far."""
         self.obs = np.stack(first)
-        """The newest observation of each episode, `[episodes, obs]`; of one that is over, its last."""
+        """The latest observation of each episode, `[episodes, obs]`; the final one if the episode has ended."""
         self.info: list[dict[str, Any]] = [{} for _ in first]
-        """What the environments said beside it."""
+        """The `info` of each episode's latest step."""
         self.playing = list(range(len(first)))
-        """Which episodes are not over."""
+        """The indices of the episodes that have not ended."""
 
     def step(self, actions: Sequence[Any] | np.ndarray) -> None:
-        """One step of each episode that is not over, with the action in its place; the other actions are ignored."""
+        """Step each episode that has not ended with its action; the actions of the others are ignored."""
         obs = self.obs.copy()
         for i in list(self.playing):
             obs[i], reward, self._terminated[i], truncated, self.info[i] = self._environments[i].step(actions[i])
@@ -55,7 +55,7 @@ class Rollout:
         self.obs = obs
 
     def episodes(self) -> list[Episode]:
-        """The episodes until here."""
+        """The steps of each episode so far."""
         made = []
         for i, steps in enumerate(self._steps):
             obs, action, reward = zip(*steps, strict=True)

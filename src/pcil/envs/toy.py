@@ -1,8 +1,8 @@
-"""Environments whose answer is known: a point mass with its optimal policy and five probes with their values.
+"""Environments with known solutions: two toys with their optimal policies and five probes with their values.
 
-The probes go from trivial to nearly real, so that the first one that an agent fails names what is broken: 1 the value
-loss, 2 the observations on their way into it, 3 discounting and bootstrapping, 4 the policy's gradient, 5 its
-observations.
+The probes get more complex one by one, so that the first one on which an agent fails tells which part is broken: 1 the value
+loss, 2 the observations that the critic is given, 3 discounting and bootstrapping, 4 the gradient of the policy, 5 the
+observations that the policy is given.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pcil.envs.dmc import checked_action
 class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
     """A point in the square [-1, 1]^2 that moves by `SPEED` times the action and earns 1 - its distance to the origin.
 
-    An episode starts anywhere and is truncated after `NUM_STEPS` steps.
+    An episode starts at a uniformly random position and is truncated after `NUM_STEPS` steps.
     """
 
     SPEED = 0.1
@@ -32,13 +32,13 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
         self._position, self._steps = np.zeros(2), 0
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Puts the point anywhere in the square."""
+        """Place the point uniformly in the square."""
         super().reset(seed=seed)
         self._position, self._steps = self.np_random.uniform(-1.0, 1.0, 2), 0
         return self._position.astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Moves the point; the reward is that of the new position, in [1 - sqrt(2), 1]."""
+        """Move the point; the reward is that of the new position, in [1 - sqrt(2), 1]."""
         moved = self._position + self.SPEED * checked_action(action, (2,))
         self._position, self._steps = np.clip(moved, -1.0, 1.0), self._steps + 1
         reward = 1.0 - float(np.sqrt(np.sum(self._position**2)))
@@ -46,12 +46,12 @@ class PointMass(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @classmethod
     def optimal_action(cls, obs: np.ndarray) -> np.ndarray:
-        """Straight home along each axis: the axes do not interact, so every step is the closest that can be reached."""
+        """Move towards the origin along each axis. The axes are independent, so every step minimises the distance."""
         return np.clip(-np.asarray(obs) / cls.SPEED, -1.0, 1.0)
 
 
 class Reach(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A point on the line [-2, 2] that moves by `SPEED` times the action; an episode ends where the goal is reached.
+    """A point on the line [-2, 2] that moves by `SPEED` times the action; an episode terminates when it reaches the goal.
 
     The observation is `[position, goal]`, the reward minus the distance. An episode is truncated after `NUM_STEPS` steps.
     """
@@ -66,13 +66,13 @@ class Reach(gymnasium.Env[np.ndarray, np.ndarray]):
         self._state, self._steps = np.zeros(2), 0
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Puts point and goal anywhere in [-1, 1]."""
+        """Place point and goal uniformly in [-1, 1]."""
         super().reset(seed=seed)
         self._state, self._steps = self.np_random.uniform(-1.0, 1.0, 2), 0
         return self._state.astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Moves the point; it terminates within `REACHED` of the goal."""
+        """Move the point; the episode terminates within `REACHED` of the goal."""
         self._state[0] = np.clip(self._state[0] + self.SPEED * checked_action(action, (1,))[0], -2.0, 2.0)
         self._steps += 1
         distance = float(abs(self._state[0] - self._state[1]))
@@ -82,12 +82,12 @@ class Reach(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @classmethod
     def optimal_action(cls, obs: np.ndarray) -> np.ndarray:
-        """Straight to the goal."""
+        """Move towards the goal."""
         return np.clip((obs[..., 1:] - obs[..., :1]) / cls.SPEED, -1.0, 1.0)
 
 
 class Probe(gymnasium.Env[np.ndarray, np.ndarray], abc.ABC):
-    """One number observed, one number acted; terminates after one step unless the probe says otherwise."""
+    """An environment with a scalar observation and a scalar action; by default it terminates after one step."""
 
     def __init__(self) -> None:
         self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -95,13 +95,13 @@ class Probe(gymnasium.Env[np.ndarray, np.ndarray], abc.ABC):
         self._obs = np.zeros(1, np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts with the probe's first observation."""
+        """Start with the probe's first observation."""
         super().reset(seed=seed)
         self._obs = np.array([self._first_obs()], np.float32)
         return self._obs, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Pays what the probe pays for this action in this observation."""
+        """Return the probe's reward for this action in this observation."""
         reward = self._pay(float(self._obs[0]), float(checked_action(action, (1,))[0]))
         next_obs = self._next_obs(float(self._obs[0]))
         self._obs = np.array([0.0 if next_obs is None else next_obs], np.float32)
@@ -109,13 +109,13 @@ class Probe(gymnasium.Env[np.ndarray, np.ndarray], abc.ABC):
 
     @abc.abstractmethod
     def value(self, obs: float, discount: float) -> float:
-        """The return of the best policy from `obs` on."""
+        """The discounted return of the optimal policy from `obs`."""
 
     def _first_obs(self) -> float:
         return 0.0
 
     def _next_obs(self, obs: float) -> float | None:
-        """What follows `obs`; None is the end."""
+        """The observation after `obs`; None if the episode terminates."""
         del obs
         return None
 
@@ -141,7 +141,7 @@ class ConstantReward(Probe):
 
 
 class ObservedReward(Probe):
-    """Probe 2: the reward is the observation, +1 or -1. A value that does not follow means that it is fed wrongly."""
+    """Probe 2: the reward is the observation, +1 or -1. A value that differs means that the critic gets wrong observations."""
 
     def value(self, obs: float, discount: float) -> float:
         """The observation."""
@@ -189,7 +189,7 @@ class ActionReward(Probe):
 
 
 class ObservedActionReward(ActionReward):
-    """Probe 5: the reward is -(action - 0.5 * observation)^2, the observation +1 or -1: the policy must look."""
+    """Probe 5: the reward is -(action - 0.5 * observation)^2 with observation +1 or -1: the policy must use its observation."""
 
     def optimal_action(self, obs: float) -> float:
         """Half of the observation."""

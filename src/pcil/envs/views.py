@@ -1,9 +1,9 @@
 """Observation and reward of the ten tasks from prebuilt NumPy views of MuJoCo's data, bit for bit dm_control's.
 
-dm_control looks every quantity up by name at every step, which costs more than the physics of a small body. Each
-function here does the look-up once and returns `(fill_observation, reward)`. The arithmetic is dm_control's, in its
-order and with its constants: NumPy's `exp`, `log1p` and `arcsinh` (whose last bit is not libm's), its sums and powers.
-`tests/envs/test_dmc.py` holds each against dm_control over whole episodes.
+dm_control looks up every quantity by name in every step, which costs more than the physics of a small body. Each function
+here does the lookups once and returns `(fill_observation, reward)`. The arithmetic has dm_control's order and constants, and
+uses NumPy's `exp`, `log1p` and `arcsinh`, whose last bit can differ from libm's. `tests/envs/test_dmc.py` compares each with
+dm_control over complete episodes.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ import numpy as np
 FillObservation = Callable[[np.ndarray], None]
 """Writes the observation into a float32 row."""
 Reward = Callable[[], float]
-"""The reward of the present state, in float64."""
+"""The reward of the current state, in float64."""
 Views = tuple[FillObservation, Reward]
 
 
 def views_for(task: str) -> Callable[[Any], Views] | None:
-    """What builds the views of a task from its dm_control environment; None for a task that has none."""
+    """The function that builds the views of a task from its dm_control environment; None if the task has no views."""
     return {
         "finger_spin": finger_spin,
         "hopper_stand": hopper,

@@ -1,4 +1,4 @@
-"""The mathematics, one function an equation. Each loss is a mean over the batch; coefficients belong to the caller."""
+"""Losses and targets, one function per equation. Each loss is a mean over the batch; the caller applies coefficients."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ def info_nce(
     negatives: Float[Array, "negatives dim"],
     temperature: float,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """How badly each anchor tells its positive from the negatives (PCIL, Eq. 1 with its sign corrected).
+    """InfoNCE: the cross-entropy of identifying the positive among the negatives (PCIL, Eq. 1 with its sign corrected).
 
     For anchor `a`, positive `p`, negatives `n_j` and `s(x, y) = x . y / temperature` the loss is
 
         -log( exp s(a, p) / (exp s(a, p) + sum_j exp s(a, n_j)) )  =  -s(a, p) + log( exp s(a, p) + sum_j exp s(a, n_j) )
 
     The paper prints Eq. 1 with `+ s(a, p)`, which would push expert pairs apart; its Eq. 4 and the authors' code have the
-    minus. With all similarities equal the loss is `log(1 + negatives)`; it is never negative. Beside the loss come the mean
-    positive and negative cosine and the share of anchors whose positive is nearer than every negative.
+    minus. The loss is never negative, and `log(1 + negatives)` if all similarities are equal. The diagnostics are the mean
+    positive and negative cosine and the fraction of anchors that are closer to their positive than to every negative.
     """
     return contrast(jnp.sum(anchor * positive, axis=-1), anchor @ negatives.T, temperature)
 
@@ -31,7 +31,7 @@ def info_nce(
 def contrast(
     cosine_positive: Float[Array, " batch"], cosine_negative: Float[Array, "batch negatives"], temperature: float
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """InfoNCE and its diagnostics from each anchor's cosines, whoever its negatives are."""
+    """InfoNCE and its diagnostics from the cosines of each anchor with its positive and its own negatives."""
     logits = jnp.concatenate([cosine_positive[:, None], cosine_negative], axis=-1) / temperature
     loss = jnp.mean(jax.nn.logsumexp(logits, axis=-1) - logits[:, 0])
     diagnostics = {
@@ -54,13 +54,13 @@ def group_info_nce(
     others: Float[Array, "others dim"],
     temperature: float,
 ) -> Float[Array, ""]:
-    """InfoNCE with every row as anchor: each other row of its group is a positive, rows of other groups and `others` negatives.
+    """InfoNCE with every row as anchor: the other rows of its group are positives, rows of other groups and `others` negatives.
 
-    For anchor `i`, `s` as in `info_nce` and the negatives `n` of `i`, a positive `p` costs
+    With `s` as in `info_nce`, the loss of anchor `i` with a positive `p` and the negatives `n` is
 
         -log( exp s(i, p) / (exp s(i, p) + sum_n exp s(i, n)) )  =  softplus( log sum_n exp s(i, n) - s(i, p) )
 
-    and the loss is the mean over the anchors of the mean over their positives. A row alone in its group adds 0.
+    This is averaged over the positives of each anchor and then over the anchors. A row that is alone in its group adds 0.
     """
     same = group[:, None] == group[None, :]
     positive = same & ~jnp.eye(len(rows), dtype=bool)
@@ -74,9 +74,9 @@ def group_info_nce(
 def gradient_penalty(
     scalar: Callable[[Float[Array, "batch dim"]], Float[Array, " batch"]], x: Float[Array, "batch dim"]
 ) -> Float[Array, ""]:
-    """`mean( (|| d scalar_i / d x_i ||_2 - 1)^2 )`: how far the slope is from 1 (Gulrajani et al. 2017; paper Appendix B).
+    """`mean( (|| d scalar_i / d x_i ||_2 - 1)^2 )`: the gradient penalty (Gulrajani et al. 2017; paper Appendix B).
 
-    Row `i` of `scalar` may depend on row `i` of `x` only; then one backward pass of the sum gives every row's gradient.
+    Row `i` of `scalar(x)` must depend on row `i` of `x` only; then one backward pass through the sum gives all gradients.
     """
     gradient = jax.grad(lambda rows: jnp.sum(scalar(rows)))(x)
     norm = jnp.sqrt(jnp.sum(gradient * gradient, axis=-1) + 1e-12)
@@ -86,7 +86,7 @@ def gradient_penalty(
 def interpolate(
     u: Float[Array, "batch 1"], expert: Float[Array, "batch dim"], agent: Float[Array, "batch dim"]
 ) -> Float[Array, "batch dim"]:
-    """Points on the segments between expert and agent, `u = 1` at the expert: where the penalty is taken."""
+    """The points at which the gradient penalty is evaluated: on the segments between expert (`u = 1`) and agent (`u = 0`)."""
     return u * expert + (1 - u) * agent
 
 
@@ -94,7 +94,7 @@ def binary_cross_entropy(expert: Float[Array, " batch"], agent: Float[Array, " b
     """`-log D` on the expert's logits and `-log(1 - D)` on the agent's, both as means, with `D = sigmoid(logit)`.
 
     `-log sigmoid(d) = softplus(-d)` and `-log(1 - sigmoid(d)) = softplus(d)`: finite for every logit. The expert has label 1
-    (authors' code; the paper's Preliminaries have it the other way round).
+    (authors' code; the paper's Preliminaries have the labels the other way round).
     """
     return jnp.mean(jax.nn.softplus(-expert)) + jnp.mean(jax.nn.softplus(agent))
 
@@ -107,7 +107,7 @@ def n_step_target(
 ) -> Float[Array, " batch"]:
     """`sum_k gamma^k c_k r_k + gamma^n c_n V`, where `c_k` is the product of the discounts before step `k`.
 
-    `discount` is 0 at a terminating step, so nothing after it counts, and `bootstrap` is the value after the last step.
+    `discount` is 0 at a terminating step, so later steps add nothing. `bootstrap` is the value `V` after the last step.
     """
     target = bootstrap
     for k in reversed(range(reward.shape[1])):

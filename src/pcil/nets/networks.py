@@ -1,4 +1,4 @@
-"""The networks, each written once: `xp=jnp` inside the compiled step, `xp=np` where a policy acts on the host.
+"""The networks. Each is written once for two backends: `xp=jnp` in compiled code, `xp=np` for acting on the host.
 
 Weights are `[in, out]`. Every linear layer starts orthogonal with gain 1 and bias 0 (authors' code: utils.py, `weight_init`).
 """
@@ -17,11 +17,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 LAYER_NORM_EPSILON = 1e-5
 SCALER_RATE = 1e-3
-"""Least share of a new batch in the running statistics of observations."""
+"""The smallest weight of a new batch in the running statistics of observations."""
 SCALER_FLOOR = 1e-6
-"""Least standard deviation that an entry is divided by, as a share of its mean: the mean itself has no more digits."""
+"""The smallest standard deviation of an entry relative to its mean; the float32 mean is not more accurate than this."""
 LEAST_DEVIATION = 1e-20
-"""Of an entry that is always 0: small beside any unit, and no division by it overflows."""
+"""The smallest standard deviation of an entry that is always 0; dividing by it does not overflow."""
 SCALED_BOUND = 10.0
 """Scaled observations are clipped to this many standard deviations."""
 
@@ -32,7 +32,7 @@ def orthogonal(key: PRNGKeyArray, shape: tuple[int, int]) -> Float[Any, "in out"
 
 
 def _rows(vector: Float[Any, " dim"], x: Float[Any, "*batch dim"]) -> Float[Any, "*ones dim"]:
-    """`vector` with as many axes as `x`, so that no rank is promoted silently."""
+    """`vector` with leading axes of size 1, so that it has the rank of `x` and no rank is promoted implicitly."""
     return vector.reshape((1,) * (x.ndim - 1) + vector.shape)
 
 
@@ -48,7 +48,7 @@ class MLP(eqx.Module):
 
     @classmethod
     def init(cls, sizes: tuple[int, ...], *, key: PRNGKeyArray) -> MLP:
-        """`sizes` = input, hidden ..., output."""
+        """`sizes` are the widths of input, hidden layers and output."""
         keys = jax.random.split(key, len(sizes) - 1)
         shapes = list(itertools.pairwise(sizes))
         weights = tuple(orthogonal(k, shape) for k, shape in zip(keys, shapes, strict=True))
@@ -61,7 +61,7 @@ class MLP(eqx.Module):
 
 
 class Normalizer(eqx.Module):
-    """Observations in standard deviations from their mean, clipped to `SCALED_BOUND` of them."""
+    """Standardises observations to mean 0 and standard deviation 1, and clips them to `[-SCALED_BOUND, SCALED_BOUND]`."""
 
     mean: Float[Any, " obs"]
     deviation: Float[Any, " obs"]
@@ -72,14 +72,14 @@ class Normalizer(eqx.Module):
 
 
 class Trunk(eqx.Module):
-    """Linear, layer normalisation, tanh: observations to features in (-1, 1) (authors' code: agent/drqv2.py)."""
+    """Linear layer, layer normalisation and tanh: maps observations to features in (-1, 1) (authors' code: agent/drqv2.py)."""
 
     weight: Float[Any, "obs features"]
     bias: Float[Any, " features"]
     scale: Float[Any, " features"]
     offset: Float[Any, " features"]
     normalizer: Normalizer | None = None
-    """What observations go through first, where the trunk takes them in the environment's units."""
+    """Normalises observations first if the trunk is given them in the environment's units."""
 
     @classmethod
     def init(cls, obs_dim: int, feature_dim: int, *, key: PRNGKeyArray) -> Trunk:
@@ -93,14 +93,14 @@ class Trunk(eqx.Module):
     def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch features"]:
         obs = obs if self.normalizer is None else self.normalizer(obs, xp)
         x = _add(obs @ self.weight, self.bias)
-        share = 1 / x.shape[-1]  # NumPy's own mean takes longer than the whole layer
+        share = 1 / x.shape[-1]  # np.mean takes longer than the rest of the layer
         centred = x - x.sum(axis=-1, keepdims=True) * share
         variance = (centred * centred).sum(axis=-1, keepdims=True) * share
         normal = centred / xp.sqrt(variance + LAYER_NORM_EPSILON)
         return xp.tanh(_add(normal * _rows(self.scale, normal), self.offset))
 
     def without_last(self) -> Trunk:
-        """The trunk of observations that lack the last entry, which is 0 in all of them."""
+        """The equivalent trunk for observations without their last entry, assuming that this entry is always 0."""
         if self.normalizer is None:
             return dataclasses.replace(self, weight=self.weight[:-1])
         last = self.normalizer(jnp.zeros_like(self.normalizer.mean))[-1]
@@ -111,24 +111,24 @@ class Trunk(eqx.Module):
 class Scaler(eqx.Module):
     """Running mean and variance of observations.
 
-    Scaled observations are the same whatever units an entry `x` comes in: as `a x + b`, and its mean and deviation with it.
+    Scaled observations do not depend on the units of an entry: they are the same for `x` and for `a x + b`.
     """
 
     mean: Float[Any, " obs"]
     variance: Float[Any, " obs"]
     count: Float[Any, ""]
-    """Batches seen."""
+    """The number of batches so far."""
 
     @classmethod
     def init(cls, obs_dim: int) -> Scaler:
         return cls(jnp.zeros(obs_dim), jnp.ones(obs_dim), jnp.zeros(()))
 
     def update(self, obs: Float[Array, "batch obs"]) -> Scaler:
-        """The plain average over the first batches, then over about the last `1 / SCALER_RATE`.
+        """Update with a batch: an average over all batches at first, then an exponential one over about `1 / SCALER_RATE`.
 
         Mixing a batch of mean `m` and variance `v` at rate `r` into `mean` and `variance` gives the mixture's variance,
-        `(1 - r) variance + r v + r (1 - r) (m - mean)^2`. Sums are taken of distances from the batch's first row: far from
-        zero they keep their digits, and an entry that never varies has its mean exactly.
+        `(1 - r) variance + r v + r (1 - r) (m - mean)^2`. Moments are computed relative to the batch's first row, which avoids
+        cancellation for values far from 0 and makes the mean of a constant entry exact.
         """
         rate = jnp.maximum(1 / (self.count + 1), SCALER_RATE)
         distance = obs - obs[:1]
@@ -140,23 +140,23 @@ class Scaler(eqx.Module):
 
     @property
     def normalizer(self) -> Normalizer:
-        """What observations are scaled by now; an entry that has never varied is 0 there and at the bound elsewhere."""
+        """The current normaliser. It maps an entry that was always constant to 0, or to the bound once it changes."""
         deviation = jnp.sqrt(self.variance + (SCALER_FLOOR * self.mean) ** 2)
         return Normalizer(self.mean, jnp.maximum(deviation, LEAST_DEVIATION))
 
 
 def scaled(scaler: Scaler | None, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch obs"]:
-    """Observations as networks are given them in an update."""
+    """Observations as the networks get them in an update."""
     return obs if scaler is None else scaler.normalizer(obs)
 
 
 def unscaled(trunk: Trunk, scaler: Scaler | None) -> Trunk:
-    """The trunk of observations in the environment's units, from one of scaled observations."""
+    """A trunk for observations in the environment's units, from a trunk for scaled observations."""
     return dataclasses.replace(trunk, normalizer=scaler and scaler.normalizer)
 
 
 class Actor(eqx.Module):
-    """The mean action: trunk, two hidden layers, tanh."""
+    """The actor, whose output is the mean action: trunk, two hidden layers, tanh."""
 
     trunk: Trunk
     head: MLP
@@ -172,7 +172,7 @@ class Actor(eqx.Module):
 
 
 class Critic(eqx.Module):
-    """Two values of a state and an action on one trunk; the trunk's features are what imitation rewards see."""
+    """Twin Q-functions with a common trunk; imitation rewards may use the trunk's features."""
 
     trunk: Trunk
     heads: tuple[MLP, MLP]
@@ -192,7 +192,7 @@ class Critic(eqx.Module):
     def values(
         self, features: Float[Any, "*batch features"], action: Float[Any, "*batch action"]
     ) -> tuple[Float[Any, "*batch"], Float[Any, "*batch"]]:
-        """Both values from features of the trunk."""
+        """Both Q-values, from features of the trunk."""
         x = jnp.concatenate([features, action], axis=-1)
         first, second = (head(x)[..., 0] for head in self.heads)
         return first, second

@@ -1,4 +1,4 @@
-"""Exploration: a linear schedule of the standard deviation and the clamped normal of DrQ-v2."""
+"""Exploration noise: a linear schedule of the standard deviation, and DrQ-v2's clamped normal distribution."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ACTION_MARGIN = 1e-6
 
 @dataclass(frozen=True)
 class LinearSchedule:
-    """From `start` to `end` over `steps` agent steps, then constant."""
+    """A value that changes linearly from `start` to `end` over `steps` agent steps and is constant afterwards."""
 
     start: float = 1.0
     end: float = 0.1
@@ -38,7 +38,7 @@ class LinearSchedule:
 def normal_steps(rng: np.random.Generator, dim: int, correlation: float) -> Iterator[Float[np.ndarray, " dim"]]:
     """Standard normal vectors, each correlated with the one before: `x' = c x + sqrt(1 - c^2) z`, whose variance stays 1.
 
-    This is the Ornstein-Uhlenbeck noise of DDPG (Lillicrap et al. 2016), started from its own distribution.
+    This is the Ornstein-Uhlenbeck noise of DDPG (Lillicrap et al. 2016), started from its stationary distribution.
     """
     fresh = np.float32((1 - correlation**2) ** 0.5)
     steps = rng.standard_normal(dim, dtype=np.float32)
@@ -50,7 +50,7 @@ def normal_steps(rng: np.random.Generator, dim: int, correlation: float) -> Iter
 def add_noise(
     mean: Float[Any, "*batch action"], noise: Float[Any, "*batch action"], xp: ModuleType = jnp
 ) -> Float[Any, "*batch action"]:
-    """`mean + noise`, clamped into the action range; the clamp passes the gradient of `mean` through unchanged."""
+    """`mean + noise`, clamped to the action range with a straight-through gradient."""
     raw = mean + noise
     clamped = xp.minimum(xp.maximum(raw, ACTION_MARGIN - 1), 1 - ACTION_MARGIN)
     return clamped if xp is not jnp else raw + jax.lax.stop_gradient(clamped - raw)

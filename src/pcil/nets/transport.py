@@ -1,4 +1,4 @@
-"""Optimal transport by POT, called from compiled code."""
+"""Optimal transport with POT, called from compiled code."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def sinkhorn_plan(
     epsilon: float,
     iterations: int,
 ) -> Float[Array, "rows columns"]:
-    """The plan `M` that makes `sum_ij M_ij C_ij + epsilon sum_ij M_ij log M_ij` least (Cuturi 2013).
+    """The transport plan `M` that minimises `sum_ij M_ij C_ij + epsilon sum_ij M_ij log M_ij` (Cuturi 2013).
 
-    Row `i` holds the share `x_weight_i` of the mass and column `j` the share `y_weight_j`; those of padding are 0, and what the
-    cost is there makes no difference. After `iterations` rounds the sums of the rows are exact, those of the columns near; POT
-    stops earlier where they are exact to 1e-9. No gradient flows through the plan.
+    The marginals are `x_weight` and `y_weight`, normalised to 1. Padding has weight 0, and its costs are ignored. After
+    `iterations` iterations the row sums are exact and the column sums approximate; POT stops early once their error is below
+    1e-9. No gradient flows through the plan.
     """
-    import ot  # here, on the thread that traces: the one that calls back must not be the first to load it
+    import ot  # imported while tracing: it must not be imported for the first time in the callback's thread
 
     solve = functools.partial(_solve, ot.sinkhorn, epsilon, iterations)
     like = jax.ShapeDtypeStruct(cost.shape, cost.dtype)
@@ -31,10 +31,11 @@ def sinkhorn_plan(
 
 
 def _solve(sinkhorn, epsilon: float, iterations: int, cost: Array, *weights: Array) -> np.ndarray:
-    """By NumPy alone, for JAX may be waiting for this; in float64, where `exp(-cost / epsilon)` vanishes at 745 only."""
-    shares = [np.asarray(weight, np.float64) for weight in weights]
-    held = np.ix_(*(share > 0 for share in shares))
-    mass = [share[share > 0] / share.sum() for share in shares]
+    """The callback. It uses NumPy only, since JAX may be blocked meanwhile; in float64, `exp(-cost / epsilon)` underflows only
+    at 745."""
+    marginals = [np.asarray(weight, np.float64) for weight in weights]
+    present = np.ix_(*(marginal > 0 for marginal in marginals))
+    masses = [marginal[marginal > 0] / marginal.sum() for marginal in marginals]
     plan = np.zeros(cost.shape, np.float32)
-    plan[held] = sinkhorn(*mass, np.asarray(cost, np.float64)[held], epsilon, numItermax=iterations, warn=False)
+    plan[present] = sinkhorn(*masses, np.asarray(cost, np.float64)[present], epsilon, numItermax=iterations, warn=False)
     return plan

@@ -19,7 +19,7 @@ from pcil.seeds import Stream
 from pcil.training import learner, runs, state
 from pcil.training.callbacks import Callback
 from pcil.training.collect import play
-from pcil.training.config import Run
+from pcil.training.config import Run, run_of_file
 from pcil.types import Batch, Episode
 
 EXPERT_STEPS, AGENT_STEPS = 128, 256
@@ -55,7 +55,7 @@ def transitions(source: Source, row: EvalRow, trust: Sequence[str] = ()) -> list
 
     Empty if the run's reward has no representation; `InputError` if the run can't be restored.
     """
-    run = Run.from_json(source.settings)
+    run = run_of_file(f"The run in {source.folder}", source.settings, trust)
     if type(run.reward).representation is Reward.representation:
         return []
     modules.admit(f"The run in {source.folder}", modules.of_task(run.task, run.env_kwargs), trust)

@@ -1,4 +1,4 @@
-"""`pcil sweep`: many runs, side by side. What is done and what is left is read from the run folders alone."""
+"""`pcil sweep`: train many runs in parallel. The state of each run is read from its folder alone."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from pcil.sweep.plans import Job, Plan
 from pcil.training.progress import Signals, time_left
 
 RETRIES = 8
-"""How often a run is taken up again after its process was killed."""
+"""How often a run is resumed after its process was killed."""
 PAUSE_SECONDS = 0.5
-"""How long it takes at most until the end of a run is noticed."""
+"""The interval at which runs are polled."""
 VISIBLE_SECONDS = 15.0
-"""How long a finished run's DONE is waited for."""
+"""How long to wait for the DONE file of a finished run."""
 
 
 def sweep(plan: Plan, out: Path, limit: int | None, address: str | None, console: Console) -> int:
-    """Finish every run of a plan, at most `limit` at a time; 1 where some failed, 130 or 143 where a signal stopped them.
+    """Finish every run of a plan, at most `limit` at a time, on this machine or on the Ray cluster at `address`.
 
-    They are trained on this machine, or on the Ray cluster at an address.
+    Returns the exit code: 1 if a run failed, 130 or 143 if a signal stopped the sweep.
     """
 
     def say(text: str) -> None:
@@ -62,9 +62,9 @@ def sweep(plan: Plan, out: Path, limit: int | None, address: str | None, console
 
 @contextlib.contextmanager
 def _executor(plan: Plan, out: Path, limit: int | None, address: str | None) -> Iterator[executors.Executor]:
-    """Where the runs are trained; `InputError` where the folder `out` can't be made."""
-    place = executors.Local(plan, limit) if address is None else cluster.connected(plan, limit, address, out / "ray.log")
-    with place as executor:
+    """The executor of the runs; `InputError` if the folder `out` can't be created."""
+    context = executors.Local(plan, limit) if address is None else cluster.connected(plan, limit, address, out / "ray.log")
+    with context as executor:
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -75,7 +75,7 @@ def _executor(plan: Plan, out: Path, limit: int | None, address: str | None) -> 
 def _train_all(executor: executors.Executor, jobs: list[Job], limit: int | None, signals: Signals) -> Iterator[str]:
     """Train the jobs, as many at a time as there is room for, until all have ended or a signal has stopped them.
 
-    Yields what there is to say: how a job ended, and nothing at every pause.
+    Yields a message when a job ends, and an empty text in every polling interval.
     """
     running: dict[Any, Job] = {}
     stopping = False
@@ -104,7 +104,7 @@ def _train_all(executor: executors.Executor, jobs: list[Job], limit: int | None,
 
 
 def _outcome(job: Job, end: int | str, stopping: bool) -> tuple[str, str]:
-    """The state of a job whose process has ended, with an exit code or by what killed it, and what to say of it."""
+    """The new state of a job whose process has ended, and a message; `end` is its exit code, or what killed it."""
     if end in (129, 130, 143) or (stopping and isinstance(end, str)):
         return "waiting", f"stopped {job.name} at {job.frames:,} frames"
     if isinstance(end, str) and job.deaths < RETRIES:
@@ -120,7 +120,7 @@ def _outcome(job: Job, end: int | str, stopping: bool) -> tuple[str, str]:
 
 
 def _appears(file: Path) -> bool:
-    """Whether a file that another node may have written is there; shared storage can take some seconds to show it."""
+    """Whether a file exists, with some patience: shared storage can take seconds to show a file that another node wrote."""
     until = time.monotonic() + VISIBLE_SECONDS
     while not file.exists() and time.monotonic() < until:
         time.sleep(0.5)
@@ -128,14 +128,14 @@ def _appears(file: Path) -> bool:
 
 
 def progress_table(jobs: list[Job], speed: float, room: int) -> Group:
-    """A row a run and one bar over all; where there is no room for every row, those of running runs come first."""
+    """One row per run and a progress bar for all; if there are too many rows, only the first ones, running runs first."""
     table = Table("run", "task", "method", "seed", "", "frames", "return", "frames/s", "time left", box=None)
     for job in jobs if len(jobs) <= room else sorted(jobs, key=lambda job: job.state != "running")[: max(room, 1)]:
         row = [job.folder.parent.name, job.run.task, job.run.method, str(job.run.seed), job.state]
         row += [f"{job.frames:,}/{job.run.frames:,}", f"{job.last_return:.1f}" if job.frames else ""]
         if job.state == "running":
             row += [f"{job.rate:,.0f}", time_left(job.run.frames - job.frames, job.rate)]
-        table.add_row(*(Text(shown(word, 60)) for word in row))
+        table.add_row(*(Text(shown(cell, 60)) for cell in row))
     done, total = sum(min(job.frames, job.run.frames) for job in jobs), sum(job.run.frames for job in jobs)
     count = f"{sum(job.state == 'done' for job in jobs)}/{len(jobs)} runs"
     bar = Table.grid(padding=(0, 1))

@@ -1,4 +1,4 @@
-"""Where the runs of a sweep are trained: what every such place can do, and this machine."""
+"""Executors train the runs of a sweep: their interface, and the one for this machine."""
 
 from __future__ import annotations
 
@@ -18,40 +18,41 @@ from pcil.sweep import worker
 from pcil.sweep.plans import Job, Plan
 
 WORKER = (sys.executable, "-P", "-m", worker.__name__)
-"""The command that trains a run; its folder, its number of cores and the words of `pcil train` follow."""
+"""The command that trains a run, followed by its folder, its number of cores and the argv of `pcil train`."""
 QUOTA = Path("/sys/fs/cgroup/cpu.max")
-"""Where Linux says how many microseconds of how many a container may compute."""
+"""The file in which Linux gives the CPU quota of a container: microseconds of CPU time per period."""
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """A place that trains runs side by side. A handle stands for one start of a run."""
+    """Trains runs in parallel. A handle identifies one process of a run."""
 
     def room(self) -> int:
-        """How many runs there is room for at a time."""
+        """The number of runs that can be trained at the same time."""
         ...
 
     def submit(self, job: Job) -> Any:
-        """Start a run, or go on with it, and return its handle."""
+        """Start or resume a run, and return its handle."""
         ...
 
     def poll(self, handle: Any) -> int | str | None:
-        """None while it runs, then its exit code; of a run that something killed, what it was, in words."""
+        """None while the run is active, then its exit code, or a text that says what killed it."""
         ...
 
     def stop(self, handle: Any) -> None:
-        """Ask a run to end after its episode, saved."""
+        """Ask a run to stop after its current episode and save a checkpoint."""
         ...
 
 
 class Local:
-    """This machine: a process a run. It stops after its episode once its input ends, so also where the sweep is killed.
+    """Trains each run in a process on this machine.
 
-    It is a context that kills what still runs at its end.
+    A run stops after its episode once its standard input is closed, which also happens if the sweep is killed. Leaving this
+    context manager kills the processes that are still running.
     """
 
     def __init__(self, plan: Plan, limit: int | None) -> None:
-        """`InputError` where there is no room for a run; with a limit there is where there are fewer cores."""
+        """`InputError` if the machine has no room for a run. With a `limit`, runs may share cores."""
         self._cores, self._environment = plan.cores, environment(plan)
         self._running: dict[subprocess.Popen[bytes], str] = {}
         size, gpus = math.ceil(plan.gpus), _gpus() if plan.gpus else [""]
@@ -81,12 +82,12 @@ class Local:
         used = Counter(self._running.values())
         gpus = min(self._gpus, key=lambda gpus: used[gpus])
         variables = self._environment | ({"CUDA_VISIBLE_DEVICES": gpus} if gpus else {})
-        words = [*WORKER, str(job.folder), str(self._cores), *job.argv]
+        command = [*WORKER, str(job.folder), str(self._cores), *job.argv]
         job.log.parent.mkdir(parents=True, exist_ok=True)
         with job.log.open("ab") as log:
-            # In a process group of its own a terminal's Ctrl-C does not reach it: when it is to stop, the sweep says.
+            # In its own process group, it gets no Ctrl-C from the terminal; the sweep decides when it stops.
             process = subprocess.Popen(
-                words, stdin=subprocess.PIPE, stdout=log, stderr=log, env=os.environ | variables, process_group=0
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=os.environ | variables, process_group=0
             )
         self._running[process] = gpus
         return process
@@ -105,7 +106,7 @@ class Local:
 
 
 def environment(plan: Plan) -> dict[str, str]:
-    """Variables of a run's process: as many threads as it has cores, and no GPU where it is given none."""
+    """The environment variables of a run's process: as many threads as cores, and no GPU unless the plan assigns one."""
     variables = {"OMP_NUM_THREADS": str(plan.cores), "OPENBLAS_NUM_THREADS": "1"}
     if not plan.gpus:
         variables["JAX_PLATFORMS"] = "cpu"
@@ -115,16 +116,16 @@ def environment(plan: Plan) -> dict[str, str]:
 
 
 def cores() -> int:
-    """How many cores this process may use: those it is bound to, or fewer where its container has a quota."""
+    """The number of cores that this process may use, according to its affinity and the CPU quota of its container."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with contextlib.suppress(OSError, ValueError):  # no such file, or no quota: "max 100000"
+    with contextlib.suppress(OSError, ValueError):  # no file, or no quota ("max 100000")
         quota, period = map(int, QUOTA.read_text().split())
         count = min(count, max(quota // period, 1))
     return count
 
 
 def _gpus() -> list[str]:
-    """The GPUs that CUDA may use here, by names that `CUDA_VISIBLE_DEVICES` takes."""
+    """The available GPUs, by names that are valid in `CUDA_VISIBLE_DEVICES`."""
     given = os.environ.get("CUDA_VISIBLE_DEVICES")
     if given is None:
         command = ["nvidia-smi", "--query-gpu=uuid", "--format=csv,noheader"]

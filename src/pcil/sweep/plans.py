@@ -1,4 +1,4 @@
-"""What a sweep's file asks for: each run, checked as `pcil train` checks it, and how it stands, read from its folder alone."""
+"""The runs of a sweep's file, each checked as `pcil train` does, and the state of each run as read from its folder."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ PRODUCT: dict[str, Any] = {
     "settings": {},
     "variants": {"name": {}},
 }
-"""What a product of runs may say, by example: the file itself, and each of its [[runs]]."""
+"""The valid keys of a product of runs with example values; for the file itself and for each of its [[runs]]."""
 FILE = PRODUCT | {"cores": 1, "gpus": 0.5, "runs": [{}]}
 
 
 @dataclass
 class Job:
-    """One run of a sweep, and how it stands."""
+    """One run of a sweep, and its state."""
 
     name: str
     folder: Path
     run: Run
     trust: tuple[str, ...]
-    """Modules of a person's own that the run names."""
+    """The user's modules that the run names."""
     log: Path
-    """What the run prints."""
+    """The file with the run's output."""
     state: str = "waiting"
     """waiting, running, done or failed."""
     frames: int = 0
     rate: float = 0.0
-    """Frames a second."""
+    """Frames per second."""
     last_return: float = 0.0
-    """Mean of the last evaluation."""
+    """The mean return of the last evaluation."""
     deaths: int = 0
-    """How often its process was killed."""
+    """The number of times that its process was killed."""
 
     @property
     def argv(self) -> list[str]:
@@ -61,7 +61,7 @@ class Job:
         return ["--settings", json.dumps(self.run.to_json()), "--out", str(self.folder), *trust]
 
     def look(self) -> None:
-        """Read the folder; a file that is not there yet, or half written, changes nothing."""
+        """Update the state from the run's folder; files that are missing or incomplete are ignored."""
         if (self.folder / "DONE").exists():
             self.state = "done"
         with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
@@ -74,7 +74,7 @@ class Job:
 
 
 class Plan(NamedTuple):
-    """What a sweep is to train."""
+    """The runs of a sweep, and the cores and GPUs of each."""
 
     jobs: list[Job]
     cores: int
@@ -82,7 +82,7 @@ class Plan(NamedTuple):
 
 
 def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
-    """The runs of a file, each checked as `pcil train` checks it, and how they stand. Nothing is written.
+    """The runs of a file and their states, each checked as `pcil train` does. Nothing is written.
 
     `trust` are the modules that the file may name.
     """
@@ -95,7 +95,7 @@ def read(file: Path, out: Path, trust: Sequence[str] = ()) -> Plan:
 
 
 def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str] | None) -> Plan:
-    """The same of what a file holds; `trust` is None where a person typed it, who `source` then is."""
+    """`read` for the content of a file. `trust` is None if the user typed it on the command line."""
     plan = Plan([], table.get("cores", 1), table.get("gpus", 0))
     if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
         given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
@@ -125,7 +125,7 @@ def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str]
 
 
 def _products(file: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The file's own product, where it has tasks, and its [[runs]]: these have from the file what they don't give."""
+    """The product at the top level of the file, if it has tasks, and its [[runs]], which inherit keys from the top level."""
     if "tasks" in table:
         yield file, table
     shared = {key: table[key] for key in PRODUCT if key in table and key != "variants"}
@@ -136,7 +136,7 @@ def _products(file: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str,
 
 
 def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Name and settings of each run: variants x methods x tasks x seeds. A variant with a method of its own takes no other."""
+    """The name and the settings of each run: variants x methods x tasks x seeds. A variant may set its own method instead."""
 
     def axis(key: str) -> list[Any]:
         if not product.get(key):
@@ -156,8 +156,8 @@ def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, di
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings by the names that fields have: in TOML a dotted name without quotes is a nested table, and a name may have
-    dashes as on the command line."""
+    """Settings by their dotted field names. In TOML, a dotted name without quotes is a nested table, and names may have dashes
+    as on the command line."""
     return renamed({name.replace("-", "_"): value for name, value in files.flat(settings).items()})
 
 
@@ -170,7 +170,7 @@ def _check(where: str, table: dict[str, Any], examples: dict[str, Any]) -> None:
 
 
 def _alike(value: Any, example: Any) -> bool:
-    """Whether two values of TOML have one type, and so have their parts; a whole number does for any number."""
+    """Whether two TOML values and their elements have the same types; an integer is accepted as a float."""
     if type(value) is not type(example):
         return (type(value), type(example)) == (int, float)
     value, example = ([*v.values()] if isinstance(v, dict) else v for v in (value, example))

@@ -1,4 +1,4 @@
-"""The process that trains one run of a sweep: it becomes `pcil train`, so that whatever kills it leaves no process behind."""
+"""The process of one run of a sweep. It runs `pcil train` itself, so that killing it leaves no child process behind."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from pcil import files
 from pcil.errors import InputError
 
 PATIENCE_SECONDS = 60.0
-"""How long it waits for another process to let go of the folder: one that it replaces may live a little longer."""
+"""How long to wait for the lock of the folder: the previous process of the run may still be ending."""
 
 TOPOLOGY = Path("/sys/devices/system/cpu")
-"""Where Linux says which cores are two threads of one."""
+"""The folder in which Linux describes which logical cores are threads of one physical core."""
 
 
 def train(argv: list[str], folder: Path, cores: int) -> int:
-    """Train the run in `folder` that the arguments of `pcil train` give, on so many cores of its own. Returns the exit code."""
+    """Run `pcil train` with `argv` for the run in `folder`, bound to this number of cores, and return the exit code."""
     print(f"{socket.gethostname()}, process {os.getpid()}: pcil train {shlex.join(argv)}", flush=True)
     _wait_until_free(folder / ".lock")
     held = own_cores(cores)
@@ -44,11 +44,12 @@ def train(argv: list[str], folder: Path, cores: int) -> int:
 
 
 def own_cores(count: int) -> contextlib.ExitStack:
-    """Bind this process to so many cores that no other run of a sweep has on this machine, until what it returns is closed.
+    """Bind this process to `count` cores that no other run of a sweep uses on this machine, until the result is closed.
 
-    A core is whose socket has its name, in the namespace that all users of a Linux machine share and that no file is in; a
-    killed run frees its own. Second threads of a core are taken last. Without as many free ones, or where the system can't
-    bind, nothing is bound: a run that wanders between cores is slower, and its result the same.
+    A process reserves a core by binding a Unix socket to the core's name in the abstract namespace, which all users of a Linux
+    machine share, and which needs no files; the kernel frees the name when the process ends. Second hardware threads of a core
+    are taken last. If there are not enough free cores, or if the system does not support this, the process is not bound. It may
+    then be slower, but its results are the same.
     """
     names, cores = contextlib.ExitStack(), set()
     with contextlib.suppress(AttributeError):
@@ -73,7 +74,7 @@ def _is_second_thread(core: int) -> bool:
 
 
 def _wait_until_free(lock: Path) -> None:
-    """Give the process that this one replaces time to end; `pcil train` says what is wrong with a lock that is never free."""
+    """Wait for the previous process of the run to end; `pcil train` reports a lock that stays taken."""
     until = time.monotonic() + PATIENCE_SECONDS
     with contextlib.suppress(InputError):
         while lock.exists() and time.monotonic() < until:
@@ -84,14 +85,14 @@ def _wait_until_free(lock: Path) -> None:
 
 
 def _stop_at_end_of_input() -> None:
-    """Who started this process asks it to stop by closing the pipe that is its input; that of a dead one the system closes."""
+    """Stop when standard input ends: the sweep closes this pipe, and the system does so if the sweep is killed."""
     while os.read(0, 1):
         pass
     signal.raise_signal(signal.SIGTERM)
 
 
 def main() -> int:
-    """The run whose folder, number of cores and arguments of `pcil train` are this process's arguments."""
+    """Train the run; the arguments of this process are its folder, its number of cores and the argv of `pcil train`."""
     threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
     folder, cores, *argv = sys.argv[1:]
     return train(argv, Path(folder), int(cores))

@@ -1,8 +1,8 @@
-"""Theorem 1 of the paper, `0.25 TV <= D_cont <= 2 TV`, computed on finite distributions (`pcil theory`).
+"""Theorem 1 of the paper, `0.25 TV <= D_cont <= 2 TV`, computed for finite distributions (`pcil theory`).
 
-`p` is the expert's distribution, `q` the policy's, `d = p - q`, and `S` the atoms with `p >= q`. An embedding `Phi` maps each
-atom to the unit sphere; with `v` and `w` its means under `p` and `q`, `D_cont` is the largest `v . (v - w)`. What holds, what
-does not, and the proofs are in docs/theory.md.
+`p` is the expert's distribution, `q` the policy's, `d = p - q`, and `S` the set of atoms with `p >= q`. An embedding `Phi` maps
+each atom to the unit sphere. With its means `v` and `w` under `p` and `q`, `D_cont` is the maximum of `v . (v - w)` over all
+embeddings. See docs/theory.md for the results and their proofs.
 """
 
 from __future__ import annotations
@@ -16,50 +16,50 @@ from jaxtyping import Float
 from pcil.errors import InputError
 
 Weights = Float[np.ndarray, "*pairs atoms"]
-"""A number for each atom, of one pair of distributions or of many at once."""
+"""One number per atom, for one pair of distributions or a batch of pairs."""
 Embedding = Float[np.ndarray, "*pairs atoms dim"]
-"""A unit vector for each atom."""
+"""One unit vector per atom."""
 Values = Float[np.ndarray, "*pairs"]
 
 LOWER, UPPER = 0.25, 2.0
-"""The theorem's two constants."""
+"""The constants of the theorem."""
 COUNTER_EXAMPLE = np.array([0.25, 0.75]), np.array([0.0, 1.0])
 """`p` and `q` with `TV = 0.25` and `D_cont = 0`."""
 ATOMS = (2, 3, 5, 10, 30)
-"""Sizes of the random pairs."""
+"""The numbers of atoms of the random pairs."""
 
 
 def total_variation(p: Weights, q: Weights) -> Values:
-    """Half the sum of `|p - q|`: in [0, 1], as the paper defines it."""
+    """Half the sum of `|p - q|`, in [0, 1], as in the paper."""
     return np.asarray(np.abs(_difference(p, q)).sum(axis=-1) / 2)
 
 
 def expert_mass(p: Weights, q: Weights) -> Values:
-    """`P = p(S)`: how much of the expert lies where the policy comes no more often than it."""
+    """`P = p(S)`: the expert's probability of the atoms that the policy visits at most as often as the expert."""
     return np.asarray(np.where(_difference(p, q) >= 0, p, 0).sum(axis=-1))
 
 
 def objective(phi: Embedding, p: Weights, q: Weights) -> Values:
-    """`v . (v - w)`: the mean reward of the expert above that of the policy, the negative of the loss in Eqs. 6 to 8."""
+    """`v . (v - w)`: the expert's mean reward minus the policy's, which is the negative loss of Eqs. 6 to 8."""
     v, u = (np.einsum("...n,...nk->...k", weights, phi) for weights in (p, _difference(p, q)))
     return np.asarray((v * u).sum(axis=-1))
 
 
 def relaxed(p: Weights, q: Weights) -> tuple[Values, Weights]:
-    """The largest `A B` over all `g` from the atoms to [-1, 1], with `A = sum g p` and `B = sum g d`, and that `g`.
+    """The maximum of `A B` over functions `g` from the atoms to [-1, 1], with `A = sum g p` and `B = sum g d`, and its `g`.
 
-    No embedding exceeds it: take for `g` the coordinate of `Phi` along `v`. The points `(A, B)` form a zonotope with a
-    generator `(p_i, d_i)` for each atom. `A B` is a saddle, so it is largest on the boundary, and since `-g` does as well as
-    `g`, on the upper half of it. That half starts at `g = -1` and raises one atom after the other to 1, the largest `p / q`
-    first; on each of its edges `A B` is a quadratic. Sorting is the whole cost.
+    It is an upper bound of `D_cont`: take as `g` the coordinate of `Phi` along `v`. The points `(A, B)` form a zonotope with
+    one generator `(p_i, d_i)` per atom. `A B` is a saddle, so its maximum is on the boundary and, by the symmetry `g -> -g`, on
+    the upper half of it. That half starts at `g = -1` and raises one atom after the other to 1, in decreasing order of `p / q`.
+    On each edge `A B` is quadratic. The cost is that of sorting.
     """
     d = _difference(p, q)
     order = np.argsort(-np.arctan2(d, p), axis=-1)
     p, d = (np.take_along_axis(weights, order, axis=-1) for weights in (p, d))
     a, b = (2 * (np.cumsum(weights, axis=-1) - weights) - weights.sum(axis=-1, keepdims=True) for weights in (p, d))
-    with np.errstate(all="ignore"):  # along an axis A B is linear, and any place will do
+    with np.errstate(all="ignore"):  # where A B is linear, its maximum is at one of the ends
         flat = np.nan_to_num(-(a * d + b * p) / (4 * p * d))
-    t = np.stack([np.zeros_like(a), np.clip(flat, 0, 1), np.ones_like(a)])  # both ends, and where the slope is 0
+    t = np.stack([np.zeros_like(a), np.clip(flat, 0, 1), np.ones_like(a)])  # both ends and the stationary point
     height = (a + 2 * t * p) * (b + 2 * t * d)
     t = np.take_along_axis(t, height.argmax(axis=0, keepdims=True), axis=0)[0]
     later = np.arange(p.shape[-1]) - height.max(axis=0).argmax(axis=-1)[..., None]
@@ -69,27 +69,28 @@ def relaxed(p: Weights, q: Weights) -> tuple[Values, Weights]:
 
 
 def halved(weights: Weights) -> Float[np.ndarray, "*pairs 2*atoms"]:
-    """Each atom cut into two equal ones, next to each other, as if a fair coin were thrown with every sample."""
+    """Each atom split into two adjacent ones of equal weight, as if each sample came with a fair coin toss."""
     return np.repeat(weights / 2, 2, axis=-1)
 
 
 def halves_embedding(g: Weights) -> Float[np.ndarray, "*pairs 2*atoms dim"]:
-    """The embedding of halved atoms at `(g, h)` and `(g, -h)`: then `v = (A, 0)`, and `objective` is `A B`.
+    """The embedding of split atoms at `(g, h)` and `(g, -h)`: then `v = (A, 0)`, and `objective` is `A B`.
 
-    So with halved atoms the relaxed optimum is attained, in two dimensions.
+    So with split atoms the relaxed optimum is attained in two dimensions.
     """
     h = np.sqrt(1 - g * g)
     return np.stack([np.repeat(g, 2, axis=-1), np.stack([h, -h], axis=-1).reshape(*g.shape[:-1], -1)], axis=-1)
 
 
 def attained(p: Weights, q: Weights, *, restarts: int = 4, sweeps: int = 1000, seed: int = 0) -> tuple[Values, Embedding]:
-    """The true `D_cont`, and an embedding that has it; `certificate` says how close to the optimum it is.
+    """The true `D_cont` and an embedding that attains it; `certificate` bounds the distance to the optimum.
 
-    In the Gram matrix `G` of the embedding the objective is linear, `sum_ij p_i d_j G_ij`: a semidefinite programme with unit
-    diagonal. Three dimensions hold an optimum, since vectors of given lengths that can sum to 0 at all can do so in a plane.
-    In four, each vector in turn moves to where the others want it, from random starts, until nothing improves.
+    The objective is linear in the Gram matrix `G` of the embedding, `sum_ij p_i d_j G_ij`: a semidefinite programme with unit
+    diagonal. It has a solution in three dimensions, since vectors of given lengths that can sum to 0 at all can do so in a
+    plane. This is coordinate ascent in four dimensions from random starts: each vector in turn moves to its optimum given the
+    others, until nothing improves.
     """
-    d = _difference(p, q)[..., None, :, None]  # an axis for the restarts, one for the coordinates
+    d = _difference(p, q)[..., None, :, None]  # one axis for restarts, one for coordinates
     p = p[..., None, :, None]
     phi = np.random.default_rng(seed).standard_normal((*p.shape[:-3], restarts, p.shape[-2], 4))
     phi /= np.linalg.norm(phi, axis=-1, keepdims=True)
@@ -108,15 +109,15 @@ def attained(p: Weights, q: Weights, *, restarts: int = 4, sweeps: int = 1000, s
             phi[..., i, :] = moved
     best = value.argmax(axis=-1)[..., None]
     phi = np.take_along_axis(phi, best[..., None, None], axis=-3)[..., 0, :, :]
-    return np.asarray(np.maximum(value.max(axis=-1), 0)), phi  # a constant embedding has 0
+    return np.asarray(np.maximum(value.max(axis=-1), 0)), phi  # a constant embedding attains 0
 
 
 def certificate(p: Weights, q: Weights, phi: Embedding) -> Values:
-    """A number that `D_cont` cannot exceed, by weak duality; near an optimal `phi` it is near the optimum.
+    """An upper bound of `D_cont` by weak duality; it is tight for an optimal `phi`.
 
     With `C` the symmetric part of `p d^T`, any `y`, and `e` the largest eigenvalue of `C - diag y`, or 0 if that is negative,
-    `<C, G> = sum y + <C - diag y, G> <= sum y + n e`, because `G` is semidefinite with trace `n`. An optimum has
-    `y_i = sum_j C_ij G_ij`.
+    `<C, G> = sum y + <C - diag y, G> <= sum y + n e`, because `G` is positive semidefinite with trace `n`. At an
+    optimum `y_i = sum_j C_ij G_ij`.
     """
     product = p[..., :, None] * _difference(p, q)[..., None, :]
     c = (product + np.swapaxes(product, -1, -2)) / 2
@@ -126,34 +127,34 @@ def certificate(p: Weights, q: Weights, phi: Embedding) -> Values:
 
 
 def sharper_bound(mass: Values) -> Values:
-    """The best lower bound of `D_cont / TV` that knows only `P`, where no atom is in the way; 0.25 at 0 and 2 at 1.
+    """The best lower bound of `D_cont / TV` as a function of `P`, for split atoms; 0.25 at 0 and 2 at 1.
 
-    It is `A B / TV` of the best `g` that is 1 on `S` and constant off it, and exact wherever `p / q` takes two values only.
+    It is the maximum of `A B / TV` over `g` that are 1 on `S` and constant outside, and exact if `p / q` takes only two values.
     """
     return np.where(mass <= 0.75, 0.25 / (1 - np.minimum(mass, 0.75)), 2 * (2 * mass - 1))
 
 
 def bound_with_atoms(mass: Values) -> Values:
-    """What `D_cont / TV` is at least for every pair, from one vector on `S` and its opposite off it; two atoms have no more."""
+    """A lower bound of `D_cont / TV` without split atoms, from opposite vectors on and off `S`; exact for two atoms."""
     return np.asarray(np.maximum(2 * (2 * mass - 1), 0))
 
 
 class Pairs(NamedTuple):
-    """Random pairs of distributions on equally many atoms; `relaxed`, `true` and `gap` are multiples of `TV`."""
+    """Random pairs of distributions with the same number of atoms; `relaxed`, `true` and `gap` are divided by `TV`."""
 
     atoms: int
     mass: Float[np.ndarray, " draws"]
     """`expert_mass`."""
     relaxed: Float[np.ndarray, " draws"]
-    """`D_cont` with atoms halved, by `halves_embedding`."""
+    """`D_cont` with split atoms, attained by `halves_embedding`."""
     true: Float[np.ndarray, " draws"]
-    """`D_cont` with atoms as they are."""
+    """`D_cont` of the original atoms."""
     gap: Float[np.ndarray, " draws"]
-    """How much more either of the two might be, by the relaxed optimum and by `certificate`."""
+    """An upper bound of the error of both values, from the relaxed optimum and `certificate`."""
 
 
 def random_pairs(atoms: int, draws: int = 300, seed: int = 0) -> Pairs:
-    """Both distributions from Dirichlet(1/2, ..., 1/2), so that rare atoms and heavy ones come together."""
+    """Draw both distributions from Dirichlet(1/2, ..., 1/2), which mixes rare and frequent atoms."""
     p, q = np.random.default_rng([seed, atoms]).dirichlet(np.full(atoms, 0.5), (2, draws))
     tv, (most, g), (true, phi) = total_variation(p, q), relaxed(p, q), attained(p, q, seed=seed)
     built = objective(halves_embedding(g), halved(p), halved(q))
@@ -162,7 +163,7 @@ def random_pairs(atoms: int, draws: int = 300, seed: int = 0) -> Pairs:
 
 
 def measure(pairs: Sequence[Pairs]) -> dict[str, Any]:
-    """What `pcil theory --json` prints."""
+    """The output of `pcil theory --json`."""
     rows = []
     for size in pairs:
         row: dict[str, Any] = {"atoms": size.atoms, "draws": len(size.mass)}
@@ -183,7 +184,7 @@ def measure(pairs: Sequence[Pairs]) -> dict[str, Any]:
 
 
 def table(figures: dict[str, Any]) -> str:
-    """The figures for a person."""
+    """The results as plain text."""
     rows, counter, kinds = figures["pairs"], figures["counter_example"], ("relaxed", "true")
     over = f"{'':6}   {'atoms cut into halves':^27}   {'atoms as they are':^27}"
     cells = "".join(f"   {{{kind}_min:7.4f}}{{{kind}_max:8.4f}}{{{kind}_below:12.1%}}" for kind in kinds)
@@ -200,7 +201,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def _difference(p: Weights, q: Weights) -> Weights:
-    """`p - q`, once it is sure that both are distributions."""
+    """`p - q`; `InputError` unless both are distributions."""
     for name, weights in (("p", p), ("q", q)):
         if not (np.all(weights >= 0) and np.allclose(weights.sum(axis=-1), 1, rtol=0, atol=1e-9)):
             raise InputError(f"{name} is {weights}; probabilities are at least 0 and sum to 1.")

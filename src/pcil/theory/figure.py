@@ -1,4 +1,4 @@
-"""The picture of Theorem 1: `D_cont / TV` of many pairs of distributions, and the bounds."""
+"""The figure of Theorem 1: `D_cont / TV` of many pairs of distributions, and the bounds."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pcil.errors import InputError
 from pcil.report.figures import GREY, INK, plt
 
 HOLDS, FAILS = "#0072b2", "#d55e00"
-"""Blue dots and vermilion crosses, which every eye tells apart."""
+"""Blue dots and vermilion crosses, which readers with any colour vision can tell apart."""
 
 
 def draw(pairs: Sequence[theory.Pairs], folder: Path) -> Path:
-    """Write theory.png and theory.pdf into `folder`, and return the PNG's path.
+    """Write theory.png and theory.pdf to `folder`, and return the path of the PNG.
 
-    The left panel has every pair with its atoms cut into halves, the right one the same pairs as they are.
+    The left panel shows every pair with split atoms, the right one the same pairs with their original atoms.
     """
     mass, cut, whole = (np.concatenate([getattr(size, name) for size in pairs]) for name in ("mass", "relaxed", "true"))
     p, q = theory.COUNTER_EXAMPLE
@@ -40,9 +40,9 @@ def draw(pairs: Sequence[theory.Pairs], folder: Path) -> Path:
         axis.text(0.73, 0.5, name, va="center", fontsize=9)
         star = (float(theory.expert_mass(p, q)), float(marked))
         axis.plot(*star, "*", markersize=15, color=INK, markeredgecolor="white")
-        words = f"$p=(1/4,\\ 3/4)$, $q=(0,\\ 1)$: {marked:.2f}"
+        text = f"$p=(1/4,\\ 3/4)$, $q=(0,\\ 1)$: {marked:.2f}"
         box, arrow = {"facecolor": "white", "edgecolor": "none", "pad": 2}, {"arrowstyle": "->", "shrinkB": 9, "color": INK}
-        axis.annotate(words, star, (0.25, 1.3), ha="center", fontsize=9, bbox=box, arrowprops=arrow)
+        axis.annotate(text, star, (0.25, 1.3), ha="center", fontsize=9, bbox=box, arrowprops=arrow)
         axis.set(title=title, xlabel="$P$: the expert's mass where $p\\geq q$", xlim=(0, 1), ylim=(-0.1, 2.15))
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("$D_{cont}\\,/\\,TV$")

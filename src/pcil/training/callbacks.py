@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import itertools
@@ -68,12 +69,15 @@ class Callbacks(Callback):
 
     def __init__(self, callbacks: Sequence[Callback]) -> None:
         self._callbacks = list(callbacks)
+        self._begun: list[Callback] = []
 
     def _tell(self, name: str, *arguments: Any) -> list[Any]:
         return [_call(callback, name, *arguments) for callback in self._callbacks]
 
     def begin(self, run: Run, folder: Path, history: History) -> None:
-        self._tell("begin", run, folder, history)
+        for callback in self._callbacks:
+            _call(callback, "begin", run, folder, history)
+            self._begun.append(callback)
 
     def episode(self, row: dict[str, Any]) -> None:
         self._tell("episode", row)
@@ -88,7 +92,10 @@ class Callbacks(Callback):
         return any(self._tell("stop"))
 
     def end(self) -> None:
-        self._tell("end")
+        """End every callback that has begun, even where the end of another one raises."""
+        with contextlib.ExitStack() as stack:
+            for callback in reversed(self._begun):
+                stack.callback(_call, callback, "end")
 
 
 def _call(callback: Callback, name: str, *arguments: Any) -> Any:

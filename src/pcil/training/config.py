@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from typing import Annotated, Any, Literal
 
+import jax
 import tyro
 
 from pcil import modules
@@ -16,6 +17,7 @@ from pcil.agents import AGENTS, Agent, DrQV2
 from pcil.errors import InputError, brief, check_kinds, check_ranges, json_object
 from pcil.files import flat
 from pcil.rewards import PCIL, REWARDS, Reward
+from pcil.types import Spec
 
 MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
 """Settings that change no result; a run can be resumed with other values."""
@@ -135,9 +137,12 @@ class Run:
 
     @property
     def own_modules(self) -> tuple[str, ...]:
-        """The modules of the agent and the reward where these are not part of this package."""
-        kinds = type(self.agent), type(self.reward)
-        return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not kind.__module__.startswith("pcil.")))
+        """The modules of an agent and a reward that are none of ours, and that of such an agent's actor."""
+        kinds = [type(self.agent), type(self.reward)]
+        if not modules.is_ours(kinds[0].__module__):
+            spec = Spec(obs_dim=2, action_dim=1, action_repeat=1)  # the class of the actor depends on no size
+            kinds.append(type(jax.eval_shape(lambda key: self.agent.actor(self.agent.init(spec, key=key)), jax.random.key(0))))
+        return tuple(dict.fromkeys(kind.__module__ for kind in kinds if not modules.is_ours(kind.__module__)))
 
     @property
     def needs_demos(self) -> bool:
@@ -214,15 +219,23 @@ def registered(part: str, path: str) -> str:
     return own.get(name, path) if module.startswith("pcil.") else path
 
 
-def part_of_run(part: str, spec: str, load: Any = modules.load) -> Any:
-    """The class with a name in the registry, or the class `my.module:MyClass`, whose module is imported.
-
-    With `pcil.modules:made` for `load`, an instance with the default settings.
-    """
-    if kind := REGISTRIES[part].get(spec):
-        return kind if load is modules.load else kind()
+def part_of_run(part: str, spec: str) -> Any:
+    """The class with a name in the registry, or the class `my.module:MyClass`, whose module is imported."""
+    if spec in REGISTRIES[part]:
+        return REGISTRIES[part][spec]
     base = {"agent": Agent, "reward": Reward}[part]
-    return load(f"--{part}", spec, base, f"one of {', '.join(REGISTRIES[part])}, or my.module:My{base.__name__}")
+    return modules.load(f"--{part}", spec, base, f"one of {', '.join(REGISTRIES[part])}, or my.module:My{base.__name__}")
+
+
+def run_of_file(source: str, settings: dict[str, Any], trust: Sequence[str]) -> Run:
+    """The run of the settings in the file `source`. An agent or a reward that is none of ours is imported where `trust` has its
+    module; `InputError` where it does not."""
+    values, classes = renamed(flat(settings)), {}
+    for part in REGISTRIES:
+        if named := modules.of_class(name := values[f"{part}.class"]):
+            modules.admit(source, named, trust)
+            classes[name] = part_of_run(part, name)
+    return Run.from_json(values, classes)
 
 
 def changed(settings: Any, changes: dict[str, Any]) -> Any:

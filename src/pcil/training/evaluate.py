@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from pcil import envs, modules
+from pcil.envs.checked import real_numbers
 from pcil.envs.rollout import Rollout
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
@@ -114,13 +115,17 @@ def evaluate(
                     raise ValueError(f"{len(actions)} actions for {len(rows)} observations")
                 rollout.step(actions[part])
             returns[start : numbers.stop], lengths[start : numbers.stop] = rollout.returns, rollout.lengths
-            infos += rollout.info
-    return Evaluation(returns, lengths, time.perf_counter() - begin, _reduced(infos))
+            infos += map(_scalars, rollout.info)
+    return Evaluation(returns, lengths, time.perf_counter() - begin, _columns(infos))
 
 
-def _reduced(infos: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """The numbers that all of these have in common, by name."""
-    names = [name for name in infos[0] if isinstance(name, str)]
-    columns = {name: [np.asarray(info.get(name)) for info in infos] for name in names}
-    fine = {name: all(x.size == 1 and x.dtype.kind in "fiub" for x in column) for name, column in columns.items()}
-    return {name: np.array([float(x.item()) for x in column]) for name, column in columns.items() if fine[name]}
+def _scalars(info: dict[str, Any]) -> dict[str, float]:
+    """The entries that are a single real number, copied: the environment may use the dict again."""
+    arrays = {name: real_numbers(value) for name, value in info.items() if isinstance(name, str)}
+    return {name: float(array.item()) for name, array in arrays.items() if array is not None and array.size == 1}
+
+
+def _columns(infos: Sequence[dict[str, float]]) -> dict[str, np.ndarray]:
+    """The numbers that every episode has, by name."""
+    names = [name for name in infos[0] if all(name in info for info in infos)]
+    return {name: np.array([info[name] for info in infos]) for name in names}

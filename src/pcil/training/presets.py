@@ -216,7 +216,10 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     own, changes = METHOD_SETTINGS[method, preset], renamed(changes)
     settings: dict[str, Any] = {**PRESETS[preset](task), **(own(task) if callable(own) else own)}
     parts = {part: changes.pop(part, settings[part]) for part in REGISTRIES}
-    made = {part: part_of_run(part, named, modules.made) if isinstance(named, str) else named for part, named in parts.items()}
+    made = {
+        part: modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
+        for part, named in parts.items()
+    }
     settings = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)} | changes
     for part, instance in made.items():
         own = {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}

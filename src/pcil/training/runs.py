@@ -54,7 +54,7 @@ def train(
     method: Any = "pcil",
     preset: Any = "default",
     demos: Any = None,
-    callbacks: Sequence[Callback] = (),
+    callbacks: Any = (),
     **changes: Any,
 ) -> Result:
     """Train a policy in the folder `out`, or resume the run that is there.
@@ -73,6 +73,8 @@ def train(
         raise InputError(
             f"demos is {brief(demos)}; it must be a shipped task, the path or id of a Minari dataset, or pcil.Demonstrations."
         )
+    if not isinstance(callbacks, Sequence) or not all(isinstance(callback, Callback) for callback in callbacks):
+        raise InputError(f"callbacks is {brief(callbacks)}; it must be a list of objects of subclasses of pcil.Callback.")
     given = demos if isinstance(demos, Demonstrations) else None
     named = brief(demos) if isinstance(demos, Demonstrations) else demos and os.fspath(demos)
     changes = {name: value for name, value in {**changes, "demos": named}.items() if value is not None}

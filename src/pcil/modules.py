@@ -7,7 +7,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -29,10 +29,9 @@ def of_task(task: str, env_kwargs: Any = None) -> list[str]:
     return [*([task.partition(":")[0]] if ":" in task else []), *_of_values(env_kwargs)]
 
 
-def of_class(spec: Any) -> list[str]:
-    """The module of a class that is named as `module:Class`, unless it is part of this package; none for other names."""
-    module, colon, _ = spec.partition(":") if isinstance(spec, str) else ("", "", "")
-    return [module] if colon and not is_ours(module) else []
+def of_class(spec: Any, registry: Container[str] = ()) -> list[str]:
+    """The module that is imported for a class named as `module:Class`; none for a name in the registry."""
+    return [spec.partition(":")[0]] if isinstance(spec, str) and spec not in registry else []
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:

@@ -104,7 +104,7 @@ def update_products(run: Run, spec: Spec) -> list[Any]:
 
     count = jax.ShapeDtypeStruct((), np.int32)
     batch, n, expert = run.agent.batch_size, run.agent.n_step, run.reward.batch_size
-    demos = (Batch.of(numbers(1001, spec.obs_dim), numbers(1000, spec.action_dim)),)
+    demos = (Batch(*(numbers(1000, size) for size in (spec.obs_dim, spec.action_dim, spec.obs_dim))),)
     state = jax.eval_shape(functools.partial(learner.init, run.learner, spec), demos, count)
 
     def steps(rows: int, n: int) -> Window:

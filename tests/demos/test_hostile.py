@@ -23,6 +23,7 @@ import pcil
 from pcil import cli, envs, modules
 from pcil.demos import Demonstrations, hdf5
 from pcil.errors import InputError
+from pcil.files import flat
 from pcil.nets.networks import Actor
 from pcil.policy import Policy, load_policy
 from pcil.report import representation
@@ -120,7 +121,6 @@ SWEEPS = {
     "task": ONE.replace("TASK", "evil_code:TASK"),
     "reward": ONE + '[variants.mine]\nreward = "evil_code:Mine"\n',
     "reward without a class": ONE + '[variants.mine]\nreward = "evil_code"\n',
-    "reward by a key": ONE + '[settings]\n"reward=evil_code:Mine" = 1\n',
     "arguments": ONE + '[settings]\nenv_kwargs = {x = ["evil_code:X"]}\n',
     "arguments as text": ONE + '[settings]\nenv-kwargs = \'{"x": "evil_code:X"}\'\n',
 }
@@ -134,9 +134,15 @@ def test_a_sweep_that_names_code_is_refused(name: str, evil: Path, capsys: pytes
     assert "--trust evil_code" not in refused(["sweep", "sweep.toml", "--out", "runs", "--jobs", "0"], capsys)
 
 
+def test_a_key_that_names_code_is_no_setting(evil: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (evil / "sweep.toml").write_text(f'{ONE}[settings]\n"reward=evil_code:Mine" = 1\n'.replace("TASK", POINT_MASS))
+    assert "no setting 'reward=evil_code:Mine'" in refused(["sweep", "sweep.toml", "--out", "runs"], capsys)
+    assert not ran(evil)
+
+
 def test_the_representation_of_a_run_that_names_code_is_left_out(evil: Path) -> None:
     run = small_run(task=f"evil_code:{POINT_MASS}", demos=save_point_mass_demos(evil))
-    settings = representation.flat({**run.to_json()})
+    settings = flat({**run.to_json()})
     with pytest.raises(InputError, match=r"The run in .* names code of the module 'evil_code'.*--trust evil_code"):
         representation.transitions(Source(evil, settings, True), ROW)
     assert not ran(evil)
@@ -493,6 +499,6 @@ def test_a_policy_whose_actions_are_no_numbers_is_one_sentence(tmp_path: Path, c
 
 def test_a_report_restores_no_networks_of_any_size(tmp_path: Path) -> None:
     demos = save_point_mass_demos(tmp_path)
-    settings = representation.flat(small_run(demos=demos).to_json()) | {"agent.hidden": 10**6, "agent.absorbing": False}
+    settings = flat(small_run(demos=demos).to_json()) | {"agent.hidden": 10**6, "agent.absorbing": False}
     with pytest.raises(InputError, match=r"networks of [\d,]+ numbers; at most"):
         representation.transitions(Source(tmp_path, settings, True), ROW)

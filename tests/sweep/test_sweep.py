@@ -159,13 +159,13 @@ BAD = [
     (WHOLE + "cores = 0", "0 cores"),
     (WHOLE + "gpus = -1", "-1 GPUs"),
     (WHOLE + "gpus = nan", "nan GPUs"),
-    (WHOLE.replace("pendulum_swingup", "--help"), "the task '--help', which looks like an option"),
-    (WHOLE + "[settings]\nagent.gama = 0.9", "--agent.gama"),
-    (WHOLE + "[settings]\nagent.batch_size = 64.5", "--agent.batch-size INT"),
+    (WHOLE.replace("pendulum_swingup", "--help"), "no environment '--help'"),
+    (WHOLE + "[settings]\nagent.gama = 0.9", "DrQV2 has no setting 'gama'"),
+    (WHOLE + "[settings]\nagent.batch_size = 0", "batch_size is 0; it must be at least 1"),
     (WHOLE + "[settings]\nseed = 3", "'seed' among its settings"),
     (WHOLE + "[settings]\nhelp = true", "'help' among its settings"),
     (WHOLE + "[settings]\ndemos = 'nowhere'", "'nowhere'"),
-    (WHOLE + "[variants.odd]\nlabel = 'often'", "'often'"),
+    (WHOLE + "[variants.odd]\npreset = 'odd'", "no preset 'odd'"),
     (WHOLE + "[variants]\nodd = 1", "variants = {'odd': 1}"),
 ]
 

@@ -63,8 +63,8 @@ class Constant(Reward):
     def update(self, state: Any, expert: Any, agent: Any, embed: Any, *, key: Any) -> Any:
         return state, {}
 
-    def reward(self, state: Any, obs: Any, action: Any, embed: Any, *, key: Any) -> Any:
-        return jnp.full(obs.shape[0], self.pay)
+    def reward(self, state: Any, batch: Any, embed: Any, *, key: Any) -> Any:
+        return jnp.full(batch.obs.shape[0], self.pay)
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +74,7 @@ def _registered() -> Any:
     del gymnasium.registry[EXIT]
 
 
-def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> loop.State:
+def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> state.State:
     """Uniform actions throughout, so that both kinds of action are seen whatever the agent would like."""
     agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=n_step, absorbing=absorbing)
     changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
@@ -83,9 +83,9 @@ def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> loop.
     return loop.train_loop(run, folder, ())
 
 
-def value(state: loop.State, action: float, absorbing: bool) -> float:
+def value(ended: state.State, action: float, absorbing: bool) -> float:
     obs = jnp.zeros((1, 2 if absorbing else 1))
-    return float(np.min([q[0] for q in state.learner.agent.critic(obs, jnp.full((1, 1), action))]))
+    return float(np.min([q[0] for q in ended.learner.agent.critic(obs, jnp.full((1, 1), action))]))
 
 
 @pytest.mark.parametrize("pay", [1.0, -1.0])

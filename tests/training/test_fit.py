@@ -74,7 +74,7 @@ def save(folder: Path, task: str = "test/slider-v0", *, by_us: bool = False, **k
 def fit(folder: str, task: str = "test/slider-v0", method: str = "pcil", **changes: Any) -> tuple[Demonstrations, list[str]]:
     """The demonstrations as a run has them, and what it is told."""
     said: list[str] = []
-    found = runs.demonstrations(presets.make(task, method, demos=folder, **changes), said.append)
+    _, found, _ = runs.prepared(presets.make(task, method, demos=folder, **changes), said.append)
     assert found is not None
     return found, said
 

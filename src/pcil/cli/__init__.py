@@ -16,8 +16,8 @@ COMMANDS = {
     "record": "Record demonstrations from a trained policy.",
     "theory": "Check the paper's Theorem 1 numerically, and draw it.",
     "report": "Draw figures, tables and a page from runs.",
-    "sweep": "Train many runs, side by side.",
-    "bench": "Measure the speed of each part, and its ratio to the floor.",
+    "sweep": "Train many runs in parallel.",
+    "bench": "Measure the speed of each part, and its ratio to a lower bound.",
     "doctor": "Say what is installed, what is wrong, and what to do.",
 }
 """The summary of each command; `pcil.cli.<command>` has its `main(argv)`."""

@@ -62,7 +62,7 @@ def train(argv: list[str], execute: Execute) -> int:
     task = envs.task_name(given.get("task", "walker_walk"))
     changes: dict[str, Any] = {"label": given["label"]} if given.get("label") in ("sampled", "stored") else {}
     for part in REGISTRIES.keys() & given.keys():
-        modules.admit(f"--{part}", modules.of_class(given[part]), None)
+        modules.admit(f"--{part}", modules.of_class(given[part], REGISTRIES[part]), None)
         changes[part] = given[part]
         argv = without(argv, part)
     default = presets.make(task, given.get("method", "pcil"), given.get("preset", "default"), **changes)

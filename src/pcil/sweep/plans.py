@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -14,8 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pcil import envs, files, modules
-from pcil.demos import Demonstrations
-from pcil.errors import InputError, brief
+from pcil.errors import InputError, brief, json_object
 from pcil.report.load import read_evaluations
 from pcil.training import presets, runs
 from pcil.training.config import REGISTRIES, Run, renamed
@@ -100,20 +100,22 @@ def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str]
     if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
         given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
         raise InputError(f"{source} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
-    loaded: dict[str, Demonstrations] = {}
+    read_once = functools.cache(runs.read_demonstrations)
     for where, product in _products(source, table):
         for name, settings in _combinations(where, product):
             if any(job.name == name for job in plan.jobs):
                 raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
             folder = out.absolute() / name
             try:
+                if isinstance(given := settings.get("env_kwargs"), str):
+                    settings["env_kwargs"] = json_object("env_kwargs", given)
                 named = [("The task", modules.of_task(settings["task"], settings.get("env_kwargs")))]
-                named += [(f"--{part}", modules.of_class(settings.get(part))) for part in REGISTRIES]
+                named += [(f"--{part}", modules.of_class(settings.get(part), REGISTRIES[part])) for part in REGISTRIES]
                 for option, names in named:
                     modules.admit(option, names, trust)
                 run = presets.make(**settings)
                 run = dataclasses.replace(run, task=envs.task_name(run.task))
-                runs.check(run, folder, loaded)
+                runs.check(run, folder, read_once)
             except InputError as error:
                 raise InputError(f"{where}, {name}: {error}") from error
             own = tuple(dict.fromkeys(name for _, names in named for name in names))
@@ -158,7 +160,7 @@ def _combinations(where: str, product: dict[str, Any]) -> Iterator[tuple[str, di
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings by their dotted field names. In TOML, a dotted name without quotes is a nested table, and names may have dashes
     as on the command line."""
-    return renamed({name.replace("-", "_"): value for name, value in files.flat(settings).items()})
+    return renamed({name.replace("-", "_"): None if value == "None" else value for name, value in files.flat(settings).items()})
 
 
 def _check(where: str, table: dict[str, Any], examples: dict[str, Any]) -> None:

@@ -232,7 +232,7 @@ def run_of_file(source: str, settings: dict[str, Any], trust: Sequence[str]) -> 
     module; `InputError` where it does not."""
     values, classes = renamed(flat(settings)), {}
     for part in REGISTRIES:
-        if named := modules.of_class(name := values[f"{part}.class"]):
+        if named := modules.of_class(name := values[f"{part}.class"], REGISTRIES[part]):
             modules.admit(source, named, trust)
             classes[name] = part_of_run(part, name)
     return Run.from_json(values, classes)

@@ -83,7 +83,7 @@ def train(
     run = presets.make(envs.task_name(task), method, preset, **changes)
     with progress.Signals(lambda: None, signal.SIGINT) as signals:
         try:
-            result = execute(run, Path(out), [*callbacks, _StopOn(signals)], task=task, demos=given)
+            result = execute(run, Path(out), [*callbacks, _StopOn(signals)], task=task, given=given)
         except loop.Stopped:
             if signals.number is None:
                 raise
@@ -104,15 +104,15 @@ class _StopOn(Callback):
 
 
 def execute(
-    run: Run, folder: Path, callbacks: Sequence[Callback] = (), *, task: Any = None, demos: Demonstrations | None = None
+    run: Run, folder: Path, callbacks: Sequence[Callback] = (), *, task: Any = None, given: Demonstrations | None = None
 ) -> Result:
     """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference.
 
-    `task` and `demos` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
+    `task` and `given` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
     """
     compilation.use_cache()
     folder, say = files.expanded(folder), Callbacks(callbacks).message
-    run, demos, why = prepared(run, say, task=task, given=demos)
+    run, demos, why = prepared(run, say, task=task, read=lambda source: given or read_demonstrations(source))
     with _claimed(folder), files.room_for(f"The run in {folder}"), _withdrawn_if_refused(folder):
         _describe(folder, run, demos, say)
         if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder), run.own_modules)):
@@ -153,28 +153,35 @@ def read_done(folder: Path) -> float:
         ) from error
 
 
-def demonstrations(
-    run: Run, say: Callable[[str], None] = lambda text: None, *, task: Any = None, given: Demonstrations | None = None
-) -> Demonstrations | None:
-    """What the run imitates, checked against its environment, or None where it needs no demonstrations.
+def read_demonstrations(source: str) -> Demonstrations:
+    """The demonstrations that `source` names, with actions that may be out of bounds: a run may clip them."""
+    return Demonstrations.load(source, bounded=False)
 
-    `task` and `given` stand in for what `run.task` and `run.demos` name; `say` is told what a person should know of them.
-    """
-    return prepared(run, say, task=task, given=given)[1]
+
+def demonstrations(run: Run) -> Demonstrations | None:
+    """What the run imitates, checked against its environment, or None where it needs no demonstrations."""
+    return prepared(run)[1]
 
 
 def prepared(
-    run: Run, say: Callable[[str], None] = lambda text: None, *, task: Any = None, given: Demonstrations | None = None
+    run: Run,
+    say: Callable[[str], None] = lambda text: None,
+    *,
+    task: Any = None,
+    read: Callable[[str], Demonstrations] = read_demonstrations,
 ) -> tuple[Run, Demonstrations | None, str]:
-    """The run with `agent.absorbing` decided, its `demonstrations`, and why the absorbing state is on or off."""
+    """The run with `agent.absorbing` decided, its demonstrations as they fit, and why the absorbing state is on or off.
+
+    `task` stands in for `run.task`; `read` gives the demonstrations by their name. `say` is told what a user should know.
+    """
     with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as environment:
-        demos = _fitted(run, environment, say, given)
+        demos = _fitted(run, environment, say, read)
         run, why = with_absorbing_decided(run, demos, envs.ends_early(environment))
     return run, demos, why
 
 
 def _fitted(
-    run: Run, environment: envs.Checked, say: Callable[[str], None], given: Demonstrations | None
+    run: Run, environment: envs.Checked, say: Callable[[str], None], read: Callable[[str], Demonstrations]
 ) -> Demonstrations | None:
     limit = environment.spec and environment.spec.max_episode_steps
     if limit and limit >= run.replay_steps:
@@ -184,8 +191,7 @@ def _fitted(
     if not run.needs_demos:
         return None
     source = run.task if run.demos is None else run.demos
-    loaded = given or Demonstrations.load(source, bounded=False)
-    demos = fit.fitted(run, loaded.take(run.num_demos), environment, say)
+    demos = fit.fitted(run, read(source).take(run.num_demos), environment, say)
     steps = max(run.reward.span if run.reward.batch_size else 1, run.agent.n_step if run.agent.offline else 1)
     if all(len(episode) < steps and not episode.terminated for episode in demos.episodes):
         raise InputError(
@@ -229,16 +235,9 @@ def _claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def check(run: Run, folder: Path, loaded: dict[str, Demonstrations] | None = None) -> None:
-    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there.
-
-    `loaded` has demonstrations that were read before, by what names them, and gets those that are read here.
-    """
-    source = run.task if run.demos is None else run.demos
-    loaded = {} if loaded is None else loaded
-    if run.needs_demos and source not in loaded:
-        loaded[source] = Demonstrations.load(source, bounded=False)
-    run, demos, _ = prepared(run, given=loaded.get(source))
+def check(run: Run, folder: Path, read: Callable[[str], Demonstrations] = read_demonstrations) -> None:
+    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
+    run, demos, _ = prepared(run, read=read)
     identity = _identity(run, demos)
     if (folder / "run.json").exists():
         _refuse_another(run, folder, identity)

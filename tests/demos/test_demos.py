@@ -509,6 +509,8 @@ def test_arrays_become_episodes_and_what_is_absent_is_known(tmp_path: Path) -> N
     assert bare.task == "mine" and bare.info == {"from": "me"}
     again = Demonstrations.load(bare.save(tmp_path / "bare"))
     assert not again.has_actions and not again.has_rewards and again.hash == bare.hash
+    wider = np.zeros((4, 3))
+    assert "Episode 1 of the arrays has obs" in refusal(lambda: Demonstrations.from_arrays([obs, wider]))
     assert "have no actions" in refusal(lambda: bare.action) and "have no rewards" in refusal(lambda: bare.returns)
     assert Demonstrations.from_arrays([obs], [4 * action]).action.max() == 2, "what is out of bounds is for `clip`"
     assert Demonstrations.from_arrays([obs], rewards=[reward]).has_rewards

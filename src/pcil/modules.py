@@ -30,8 +30,9 @@ def of_task(task: str, env_kwargs: Any = None) -> list[str]:
 
 
 def of_class(spec: Any, registry: Container[str] = ()) -> list[str]:
-    """The module that is imported for a class named as `module:Class`; none for a name in the registry."""
-    return [spec.partition(":")[0]] if isinstance(spec, str) and spec not in registry else []
+    """The module that is imported for a class named as `module:Class`; none for a name in the registry or a class of ours."""
+    module = spec.partition(":")[0] if isinstance(spec, str) and spec not in registry else None
+    return [] if module is None or is_ours(module) else [module]
 
 
 def admit(source: str, names: Iterable[str], trust: Sequence[str] | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import json
 import shutil
@@ -188,7 +187,7 @@ def test_no_step_is_drawn_twice_and_each_keeps_its_reward() -> None:
     run = small_run()
     batch, reward = representation._steps(run, [numbered(1, 4), numbered(11, 3)], 100, np.random.default_rng(0))
     assert sorted(reward.tolist()) == [1, 2, 3, 4, 11, 12, 13] and reward.tolist() != sorted(reward.tolist())
-    assert obs[:, 0].tolist() == action[:, 0].tolist() == reward.tolist(), "the state that the step led to"
-    paired = dataclasses.replace(run, reward=narrow(DAC(inputs="state-action")))
-    obs, action, _ = representation._steps(paired, [numbered(1, 4)], 2, np.random.default_rng(0))
-    assert len(obs) == 2 and (obs + 1 == action).all(), "the state in which the action was taken"
+    assert batch.next_obs[:, 0].tolist() == batch.action[:, 0].tolist() == reward.tolist(), "the state that the step led to"
+    assert (batch.obs + 1 == batch.action).all(), "the state in which the action was taken"
+    batch, _ = representation._steps(run, [numbered(1, 4)], 2, np.random.default_rng(0))
+    assert batch.obs.shape == batch.next_obs.shape == (2, 1)

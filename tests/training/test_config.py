@@ -180,9 +180,10 @@ def test_a_setting_by_the_name_of_an_older_version_is_the_one_of_today() -> None
     assert Run.from_json(older) == run
 
 
-def test_an_agent_by_its_name_has_those_settings_of_the_preset_that_it_has() -> None:
-    run = presets.make("walker_walk", agent="bc")
-    assert run.agent == BC(batch_size=128, n_step=1, learning_rate=5e-4, normalize_observations=True)
+def test_an_agent_that_is_not_the_methods_own_has_the_defaults_of_its_class() -> None:
+    run = presets.make("walker_walk", agent="bc", **{"agent.hidden": 32})
+    assert run.agent == BC(hidden=32)
+    assert presets.make("walker_walk", agent="drqv2") == presets.make("walker_walk")
     with pytest.raises(InputError, match=r"--agent 'nobody' can't be loaded .* one of drqv2, bc, or my.module:MyAgent"):
         presets.make("walker_walk", agent="nobody")
 

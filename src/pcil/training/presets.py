@@ -208,8 +208,8 @@ METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
 def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: Any) -> Run:
     """The run of a method with a preset, and any of its settings changed: `seed=2`, `**{"agent.gamma": 0.98}`.
 
-    `agent` and `reward` may be an instance, a name in the registry, or `my.module:MyAgent`. A named agent takes the settings
-    of the preset that it has; another reward than the method's has the defaults of its class. Unknown names raise `InputError`.
+    `agent` and `reward` may be an instance, a name in the registry, or `my.module:MyAgent`; one that is not the method's own
+    has the defaults of its class. Unknown names raise `InputError`.
     """
     _known("method", method, METHODS)
     _known("preset", preset, PRESETS)
@@ -234,9 +234,11 @@ def _counts(name: str, made: dict[str, Any], settings: dict[str, Any], parts: di
     part, _, rest = name.partition(".")
     if not rest:
         return name not in parts
-    if part == "reward":
-        return parts[part] == settings[part] and (rest != "batch_size" or made[part].needs_demos)
-    return isinstance(parts[part], str) and hasattr(made[part], rest.partition(".")[0])
+    if parts[part] != settings[part]:
+        return False
+    if part == "agent":
+        return hasattr(made[part], rest.partition(".")[0])
+    return rest != "batch_size" or made[part].needs_demos
 
 
 def _known(kind: str, name: Any, names: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Callable
@@ -13,11 +14,13 @@ import pytest
 from test_learner import DEMOS, SPEC, Recorder, Scribe, recorded
 
 from pcil import envs, seeds
+from pcil.errors import InputError
 from pcil.seeds import Stream
 from pcil.training import collect, learner, loop, state
 from pcil.training.callbacks import Callback, History
 from pcil.training.config import Run
 from pcil.training.state import Clock, Counters
+from pcil.types import Episode
 from small import POINT_MASS
 
 
@@ -152,6 +155,31 @@ def test_an_update_is_due_from_the_seed_frames_on_where_one_window_is_there(
     replay: Any = Held(windows, steps)
     assert collect._update_due.__wrapped__(run, replay, Counters(frames, steps=8)) == due
     assert not collect._update_due.__wrapped__(run, replay, Counters(frames, steps=9))
+
+
+def test_a_pass_is_refused_where_no_window_fits_into_any_of_its_episodes() -> None:
+    """With several environments that is known once all of them are stored: a short one may come first."""
+
+    def ended(steps: int) -> collect.Labelled:
+        obs, action = np.zeros((steps + 1, 2), np.float32), np.zeros((steps, 2), np.float32)
+        return collect.Labelled(Episode(obs, action, np.zeros(steps)), np.ones(steps), {})
+
+    run = recorded(agent=Scribe(n_step=5), seed_frames=10)
+    for lengths, fits in (((4, 30), True), ((30, 4), True), ((4, 4), False)):
+        held = state.start(run, SPEC, DEMOS)
+        held.counters = Counters(frames=34)
+        with contextlib.nullcontext() if fits else pytest.raises(InputError, match="cut before the 5 steps"):
+            collect.store(run, held, [ended(steps) for steps in lengths])
+        assert held.replay.num_steps == sum(lengths)
+
+
+def test_an_evaluation_copies_the_actor_to_the_host_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    copies: list[Any] = []
+    plain = state.on_host
+    monkeypatch.setattr(state, "on_host", lambda actor: copies.append(actor) or plain(actor))
+    held = state.start(recorded(), SPEC, DEMOS)
+    policy = held.policy()
+    assert all(policy(np.zeros((3, 2), np.float32)).shape == (3, 2) for _ in range(4)) and len(copies) == 1
 
 
 # --- Offline ---

@@ -116,8 +116,6 @@ def _run_of(settings: str, trust: Sequence[str]) -> Any:
     try:
         table = files.parse_json(settings.encode()) if source == "--settings" else files.read_json(Path(settings))
         run = config.run_of_file(source, table.get("run", table), trust)
-    except InputError:
-        raise
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(f"{source} holds no settings of a run ({error}); give the run.json of one.") from error
     modules.admit(source, modules.of_task(run.task, run.env_kwargs), trust)

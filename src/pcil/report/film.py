@@ -40,7 +40,9 @@ def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int =
     policy, env_kwargs = playable(folder, None, trust)
     with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=env_kwargs) as env:
         policy.check_fits(env)
-        rollout = Rollout([env], [seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)], ["the filmed episode"])
+        rollout = Rollout(
+            [env], [seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)], ["the filmed episode"], keep=False
+        )
         frames = []
         while rollout.playing and rollout.lengths[0] < steps:
             if rollout.lengths[0] % every == 0:

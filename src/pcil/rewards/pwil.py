@@ -26,7 +26,7 @@ class PWILState(eqx.Module):
     """The demonstrations and how they are measured; only the slow features ever change."""
 
     atoms: Float[Array, "atoms inputs"]
-    """Expert steps, as `seen` gives them, before they are standardised or embedded."""
+    """Expert steps, as `PWIL.points` gives them, before they are standardised or embedded."""
     mean: Float[Array, "1 inputs"]
     deviation: Float[Array, "1 inputs"]
     horizon: Int[Array, ""]

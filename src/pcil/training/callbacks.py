@@ -186,10 +186,10 @@ class TensorBoard(Callback):
             self.episode(row)
         for frames, group in itertools.groupby(history.evaluations, key=lambda row: row["frames"]):
             episodes = list(group)
-            for tag, column in (("return", "return"), ("success", "success")):
+            for column in ("return", "success"):
                 if column in episodes[0]:
                     mean = statistics.fmean(float(row[column]) for row in episodes)
-                    self._scalar(f"evaluation/{tag}", mean, int(frames), float(episodes[0]["seconds"]))
+                    self._scalar(f"evaluation/{column}", mean, int(frames), float(episodes[0]["seconds"]))
         self._writer.flush()
 
     def episode(self, row: dict[str, Any]) -> None:

@@ -86,10 +86,11 @@ def labelled(run: Run, state: State, episode: Episode, number: int) -> Labelled:
     return Labelled(kept, reward, described(episode, reward))
 
 
-def store(run: Run, state: State, ended: Labelled) -> None:
-    """Put an episode into the replay; `InputError` where updates are due and no window fits into any episode."""
-    state.replay.add(ended.episode, ended.reward if run.label == "stored" else ended.episode.reward)
-    if state.counters.frames >= run.seed_frames and not state.replay.num_windows(_window_steps(run)):
+def store(run: Run, state: State, ended: Sequence[Labelled]) -> None:
+    """Put the episodes of a pass into the replay; `InputError` if updates are due then and no window fits into any episode."""
+    for episode, reward, _ in ended:
+        state.replay.add(episode, reward if run.label == "stored" else episode.reward)
+    if ended and state.counters.frames >= run.seed_frames and not state.replay.num_windows(_window_steps(run)):
         raise InputError(
             f"Every episode of {run.task} so far is cut before the {_window_steps(run)} steps that an update needs; make its "
             "time limit longer, or agent.n_step smaller."

@@ -177,13 +177,13 @@ class Run:
         """
         values = renamed(flat(settings))
         kinds: dict[str, Any] = {}
-        for part, known in REGISTRIES.items():
-            name = values.pop(f"{part}.class")
-            if name not in {**known, **(classes or {})}:
+        for part, registry in REGISTRIES.items():
+            name, known = values.pop(f"{part}.class"), {**registry, **(classes or {})}
+            if name not in known:
                 raise InputError(
                     f"The {part} {brief(name)} is not part of this package, and code that files name is not run unasked."
                 )
-            kinds[part] = {**known, **(classes or {})}[name]
+            kinds[part] = known[name]
         own = {field.name for field in dataclasses.fields(cls)}
         plain = {name: values.pop(name) for name in list(values) if name in own}
         parts = {

@@ -15,6 +15,7 @@ from gymnasium.envs.registration import load_env_creator, registry
 
 from pcil import envs
 from pcil.demos import Demonstrations
+from pcil.demos.arrays import to_unit_box
 from pcil.errors import InputError
 from pcil.training.config import Run
 from pcil.types import Origin
@@ -104,8 +105,8 @@ def _kept(demos: Demonstrations, ours: Origin) -> Demonstrations:
     episodes = []
     for episode in demos.episodes:
         values = (high + low) / 2 + (high - low) / 2 * episode.action.astype(np.float64)
-        action = (values - (our_high + our_low) / 2) / ((our_high - our_low) / 2)
-        episodes.append(dataclasses.replace(episode, action=action.astype(np.float32)))
+        action = to_unit_box(values, our_low, our_high).astype(np.float32)
+        episodes.append(dataclasses.replace(episode, action=action))
     return dataclasses.replace(demos, episodes=tuple(episodes))
 
 

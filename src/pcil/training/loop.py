@@ -55,7 +55,7 @@ def train_loop(
         told.begin(run, folder, log.history(clock.total(), demos_return))
 
         def evaluated() -> float:
-            result = evaluate(state.policy, evaluation, seed=run.seed, episodes=run.evaluate_episodes)
+            result = evaluate(state.policy(), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
             told.evaluation(state.counters.frames, clock.total(), result)
             state.counters = replace(state.counters, evaluations=state.counters.evaluations + 1)
             states.save_policy(run, folder, state, spec, result.mean)
@@ -71,8 +71,7 @@ def train_loop(
                 refuse_divergence()
                 kept = [labelled(run, state, episode, number) for number, episode in enumerate(episodes, start=first)]
 
-            for episode in kept:
-                store(run, state, episode)
+            store(run, state, kept)
             means = states.take_means(state) | clock.times(state.counters.frames)
             with states.saved_anyway(folder, state, log, clock):
                 for number, row in enumerate([episode.row for episode in kept] or [{}], start=first):

@@ -79,9 +79,10 @@ class State:
     """The demonstrations; a checkpoint does not hold them."""
     counters: Counters
 
-    def policy(self, obs: np.ndarray) -> np.ndarray:
-        """The actor's mean actions `[k, action]` for observations `[k, obs]`, on the host."""
-        return on_host(self.actor)(obs, np)
+    def policy(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The actor's mean actions `[k, action]` of observations `[k, obs]`; its arrays are copied to the host once, here."""
+        actor = on_host(self.actor)
+        return lambda obs: actor(obs, np)
 
 
 def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:

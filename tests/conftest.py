@@ -1,10 +1,10 @@
-"""Every test runs with shapes checked at run time, no silent broadcasting of ranks or mixing of dtypes, and no warning."""
+"""Every test checks shapes at run time, and fails if ranks are broadcast or dtypes are mixed silently, or on any warning."""
 
 import os
 
 os.environ.setdefault("MUJOCO_GL", "disabled")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads only wait for each other; XLA has threads of its own
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # a worker a core
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would only wait for each other; XLA has its own threads
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # one worker per core
 
 import importlib.util
 import sys
@@ -28,7 +28,7 @@ if importlib.util.find_spec("dm_control") is None:
     real_import = dmc.import_suite
 
     def skip_or_import() -> object:
-        """What needs DeepMind Control is skipped where it is not installed, unless the test itself takes it away."""
+        """Skip tests that need DeepMind Control if it is not installed, unless the test itself hides it."""
         if "dm_control" in sys.modules:
             return real_import()
         return pytest.skip("DeepMind Control is not installed", allow_module_level=True)
@@ -38,7 +38,7 @@ if importlib.util.find_spec("dm_control") is None:
 
 @pytest.fixture(autouse=True)
 def _datasets_are_read_in_this_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes a quarter of a second less; test_hostile.py reads as everybody does."""
+    """This saves a quarter of a second per read; test_hostile.py reads in another process, as users do."""
     if request.path.name != "test_hostile.py":
         monkeypatch.setattr(hdf5, "read", hdf5.episodes)
 

@@ -1,4 +1,4 @@
-"""Run folders with numbers of one's choice: what a report reads, and nothing else."""
+"""Run folders with chosen numbers, which hold only the files that a report reads."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def fake_run(
     done: bool = True,
     **settings: Any,
 ) -> Path:
-    """A run whose evaluations every 1000 frames have these mean returns, two episodes each, 10 below and 10 above it.
+    """A run whose evaluations, every 1000 frames, have these mean returns, with one episode 10 below and one 10 above the mean.
 
-    One training episode ends at each evaluation but the first and has the correlation that is next in its row.
+    One training episode ends at each evaluation except the first, and has the next of the given correlations.
     """
     table = returns if isinstance(returns, Mapping) else {1000 * i: value for i, value in enumerate(returns)}
     folder.mkdir(parents=True, exist_ok=True)
@@ -45,7 +45,7 @@ def fake_run(
 
 
 def fake_sweep(root: Path) -> Path:
-    """PCIL and DAC on two tasks, three seeds each; PCIL ends at 100, 200, 300 and 700, 800, 900, DAC at half of it."""
+    """PCIL and DAC on two tasks with three seeds each; PCIL ends at 100, 200, 300 and 700, 800, 900, DAC at half of these."""
     for task, expert, finals in (("hopper_stand", 400.0, (100.0, 200.0, 300.0)), ("walker_run", 1000.0, (700.0, 800.0, 900.0))):
         for method, share in (("pcil", 1.0), ("dac", 0.5)):
             for seed, final in enumerate(finals, 1):

@@ -1,9 +1,9 @@
-"""Mutates everything that a command reads, and says which input ends in anything but a plain sentence: `make fuzz N=2000`.
+"""Mutate everything that a command reads, and report inputs that it does not handle cleanly: `make fuzz N=2000`.
 
-A dataset, a policy, a run's folder, a sweep's TOML file and the arguments of every command are changed at random: bits and
-bytes, values in JSON, TOML and CSV, and the objects of HDF5. A command then runs on each in a process of its own. It must end
-within 20 seconds, with exit code 0, 1 or 2, no traceback, one line on standard error where it refuses, and at most 1 GiB of
-memory more than without the change. `docs/reliability.md` has the results.
+A dataset, a policy, a run folder, a sweep's TOML file and the arguments of every command are changed at random: bits and
+bytes, values in JSON, TOML and CSV, and the objects of HDF5. A command then runs on each in a separate process. It must end
+within 20 seconds, with exit code 0, 1 or 2, no traceback, one line on standard error if it refuses, and at most 1 GiB of
+memory more than without the change. The results are in `docs/reliability.md`.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ WORDS = [
 
 
 def bytes_changed(path: Path, rng: random.Random) -> str:
-    """Bits flipped, a part cut away, doubled or overwritten, or noise at the end."""
+    """Flip bits, remove, repeat or overwrite a part, or append noise."""
     content = bytearray(path.read_bytes())
     at, size = rng.randrange(len(content) + 1), rng.choice((1, 4, 64, 1024))
     kind = rng.choice(("flip", "overwrite", "cut", "double", "end", "append"))
@@ -79,7 +79,7 @@ def bytes_changed(path: Path, rng: random.Random) -> str:
 
 
 def json_changed(path: Path, rng: random.Random) -> str:
-    """One value anywhere in it becomes another, goes, or is all there is."""
+    """Replace or remove one value anywhere in the file, or replace the whole content by one value."""
     lines = path.read_text().splitlines()
     number = rng.randrange(len(lines)) if path.suffix == ".jsonl" else 0
     top = {"": json.loads(lines[number] if path.suffix == ".jsonl" else path.read_text())}
@@ -106,7 +106,7 @@ def json_changed(path: Path, rng: random.Random) -> str:
 
 
 def table_changed(path: Path, rng: random.Random) -> str:
-    """One cell of a CSV file, or one value of a TOML file, becomes another."""
+    """Replace one cell of a CSV file or one value of a TOML file."""
     lines = path.read_text().splitlines()
     number = rng.randrange(len(lines))
     value = str(rng.choice(VALUES))
@@ -125,7 +125,7 @@ def table_changed(path: Path, rng: random.Random) -> str:
 
 
 def hdf5_changed(path: Path, rng: random.Random) -> str:
-    """One dataset of it gets another type, shape or storage, or becomes a link; or an attribute changes."""
+    """Change the type, shape or storage of one dataset of the file, turn it into a link, or change an attribute."""
     import h5py
     import numpy as np
 
@@ -201,7 +201,7 @@ HDF5: dict[str, Callable[..., None]] = {
 
 
 class Input(NamedTuple):
-    """A kind of input: the files that may be changed, how, and the commands that read it."""
+    """A kind of input: the files that may be changed, the change, and the commands that read the input."""
 
     files: tuple[str, ...]
     changes: tuple[Callable[[Path, random.Random], str], ...]
@@ -229,7 +229,7 @@ ARGUMENTS = "arguments"
 
 
 def arguments_changed(rng: random.Random) -> list[str]:
-    """A command with one word replaced, or one more option of its own or another command's, whose value is odd."""
+    """A command with one word replaced, or with an additional option, its own or another command's, that has an odd value."""
     words = rng.choice(COMMANDS).split()
     others = [word for command in COMMANDS for word in command.split() if word.startswith("--")]
     option = rng.choice(
@@ -243,7 +243,7 @@ def arguments_changed(rng: random.Random) -> list[str]:
 
 
 def prepare(place: Path) -> None:
-    """What is changed later: a run, a dataset, a file of results and a sweep, all good."""
+    """Make the valid inputs that are changed later: a run, a dataset, a file of results and a sweep."""
     from pcil import cli
     from pcil.report.load import collect, write_rows
     from small import save_point_mass_demos
@@ -265,14 +265,14 @@ class Outcome(NamedTuple):
 
 
 def refuse(*_: Any) -> None:
-    """In place of a sweep that would begin."""
+    """Replaces the start of a sweep."""
     from pcil.errors import InputError
 
     raise InputError("No run is started here; this sweep is good.")
 
 
 def run(words: list[str], folder: Path, seconds: float = SECONDS) -> Outcome:
-    """The command in a process of its own, which is forked from this one and has so many seconds."""
+    """Run the command in a process forked from this one, with a time limit."""
     began, child = time.monotonic(), os.fork()
     if child == 0:
         code = 70
@@ -308,7 +308,7 @@ def run(words: list[str], folder: Path, seconds: float = SECONDS) -> Outcome:
 
 
 def complaint(outcome: Outcome, usual: int) -> str | None:
-    """What is wrong with how a command ended, where something is."""
+    """What is wrong with the way in which a command ended, or None."""
     if outcome.seconds >= SECONDS:
         return f"still running after {SECONDS:.0f} s"
     if outcome.code < 0:
@@ -351,7 +351,7 @@ def main() -> int:
         "pcil.report.page",
         "pcil.report.film",
     ]:
-        importlib.import_module(heavy)  # so that no child has to; JAX's devices start in the child
+        importlib.import_module(heavy)  # so that the children need not; JAX's devices start in the child
     ended: collections.Counter[str] = collections.Counter()
     bad = 0
     with tempfile.TemporaryDirectory() as scratch:
@@ -377,7 +377,7 @@ def main() -> int:
                 words = rng.choice(source.commands).split()
                 if (name := " ".join(words)) not in usual:
                     shutil.copytree(good, folder)
-                    whole = run(words, folder, 600.0)  # it compiles
+                    whole = run(words, folder, 600.0)  # the first run compiles
                     usual[name] = whole.memory
                     if whole.code != (2 if words[0] == "sweep" else 0) or "Traceback" in whole.said:
                         print(f"pcil {name} fails on what was not changed:\n{whole.said}")

@@ -1,8 +1,8 @@
-"""Kills small runs of every method, damages what they left, and compares what becomes of them: `make kills N=100`.
+"""Kill small runs of every method, damage the files that they left, resume them, and compare: `make kills N=100`.
 
-A trial starts a run, ends it at a random moment by SIGKILL, by a limit on the size of its files or not at all, damages its
-folder or not, does so once or twice more, and lets the same run finish. Logs, policy, what was learned and TensorBoard's points
-must then equal those of a run that was left alone, bit for bit. `docs/reliability.md` has the results.
+A trial starts a run, may end it at a random moment by SIGKILL or by a limit on the size of its files, may damage its
+folder, does so once or twice more, and lets the run finish. Logs, policy, learned arrays and TensorBoard's points
+must then equal those of an uninterrupted run, bit for bit. The results are in `docs/reliability.md`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pathlib import Path
 
 LOGS = ("eval.csv", "train.jsonl")
 ROOM = (2_000, 20_000, 60_000)
-"""Bytes of a file, from a few rows of a log to less than a checkpoint."""
+"""Limits on the size of a file in bytes, from a few rows of a log to less than a checkpoint."""
 Fault = Callable[[Path, random.Random], None]
 
 
@@ -54,13 +54,13 @@ DAMAGE = (shortened, emptied, deleted, flipped, longer)
 
 
 def files_of(folder: Path) -> dict[str, list[Path]]:
-    """The files that a fault may hit, by kind. `run.json` is the run itself: without it there is nothing to go on with."""
+    """The files that a fault may affect, by kind. `run.json` is excluded, because without it a run can't be resumed."""
     checkpoints = sorted((p for p in (folder / "checkpoint").glob("*") if p.name.isdigit()), key=lambda path: int(path.name))
     kinds = {
         "log": [folder / name for name in LOGS],
         "policy": list((folder / "policy").glob("*")),
         "newest checkpoint": list(checkpoints[-1].glob("*")) if len(checkpoints) > 1 else [],
-        # of a finished run it is a view that nobody reads again
+        # TensorBoard's files of a finished run are never read again
         "TensorBoard": [] if (folder / "DONE").exists() else list((folder / "tensorboard").glob("*")),
         "unfinished checkpoint": [path for path in (folder / "checkpoint").glob("partial-*/*") if path.is_file()],
     }
@@ -68,7 +68,7 @@ def files_of(folder: Path) -> dict[str, list[Path]]:
 
 
 def damage(folder: Path, rng: random.Random) -> str:
-    """Damage one file of the folder, or set a DONE that comes too early; what was done, in words."""
+    """Damage one file of the folder, or write DONE too early; returns a description."""
     kinds = files_of(folder)
     if not kinds or rng.random() < 0.3:
         return "no damage"
@@ -82,7 +82,7 @@ def damage(folder: Path, rng: random.Random) -> str:
 
 
 def session(method: str, demos: str, folder: Path, every: float, room: int | None = None) -> int:
-    """Start the run, or go on with it, in a process of its own; its number."""
+    """Start or resume the run in a separate process; returns the process id."""
     child = os.fork()
     if child:
         return child
@@ -112,7 +112,7 @@ def waited(child: int) -> int:
 
 
 def trial(method: str, demos: str, folder: Path, seconds: float, rng: random.Random) -> list[str]:
-    """One run with its faults, which are returned in words; at the end it has finished, or the last word says why not."""
+    """One run with faults, whose descriptions are returned; if it does not finish, the last one says why."""
     told = []
     for _ in range(rng.randint(1, 3)):
         every = rng.choice((0.0, 0.0, 0.2, 60.0))
@@ -131,7 +131,7 @@ def trial(method: str, demos: str, folder: Path, seconds: float, rng: random.Ran
 
 
 def differences(whole: Path, folder: Path) -> Iterator[str]:
-    """What differs between a run that was left alone and one that was not, wall-clock times left out."""
+    """The differences between an uninterrupted run and another one, ignoring wall-clock times."""
     import numpy as np
     from test_loop import rows
     from test_metrics import points
@@ -165,7 +165,7 @@ def main() -> int:
         parser.error(f"there is no method {', '.join(sorted(unknown))}")
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     for heavy in ("jax", "equinox", "optax", "gymnasium", "minari", "safetensors.numpy", "pytest", "pcil.training.runs"):
-        importlib.import_module(heavy)  # so that no child has to; JAX's devices start in the child
+        importlib.import_module(heavy)  # so that the children need not; JAX's devices start in the child
     rng, methods = random.Random(options.seed), options.methods or list(presets.METHODS)
     kinds: collections.Counter[str] = collections.Counter()
     wrong = 0

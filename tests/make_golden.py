@@ -1,9 +1,9 @@
-"""Makes `golden.json` beside this file anew: numbers of five updates of every method, on narrow networks and made-up data.
+"""Regenerate `golden.json` beside this file: numbers of five updates of every method, on narrow networks and synthetic data.
 
     .venv/bin/python tests/make_golden.py
 
-Run it after a change that is meant to change numbers, and read the difference before it is committed: `git diff --stat` says
-how many methods it touches.
+Run it after a change that is meant to change numbers, and check the difference before committing it: `git diff --stat` shows
+how many methods have changed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 
 if __name__ == "__main__":
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # as the tests
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")  # as in the tests
 
 import dataclasses
 import importlib.metadata
@@ -40,11 +40,11 @@ COMMAND = "python tests/make_golden.py"
 SPEC = Spec(2, 2, 1)
 UPDATES = 5
 LABELS = ("sampled", "stored")
-"""A method whose reward is of whole episodes has the second alone."""
+"""A method that rewards whole episodes has only the second."""
 
 
 def cases() -> dict[str, Run]:
-    """Every method with every label that it can have, and settings that run other code."""
+    """Every method with every label setting that it allows, and settings that run other code."""
     found = {f"{method}, {label}": (method, {"label": label}) for method in presets.METHODS for label in LABELS}
     found = {name: case for name, case in found.items() if "stored" in name or not of_episodes(case[0])}
     runs = {name: small_run(method, **changes) for name, (method, changes) in found.items()}
@@ -76,9 +76,9 @@ def episodes(seed: int, lengths: tuple[int, ...]) -> list[Episode]:
 
 
 def five_updates(run: Run) -> dict[str, Any]:
-    """Metrics, and two sums of an episode's labels and of each part of what was learned.
+    """Metrics, and two sums of an episode's labels and of each part of the learned state.
 
-    Of a part's arrays, one after the other, these are `sum |x_i|` and `sum x_i cos(i)`, which no two entries enter alike.
+    For the concatenated arrays of a part, these are `sum |x_i|` and `sum x_i cos(i)`, in which every entry has another weight.
     """
     state = start(run, SPEC, episodes(1, (30, 41, 25)))
     for episode in episodes(2, (37, 30, 45, 28)):
@@ -111,13 +111,13 @@ def five_updates(run: Run) -> dict[str, Any]:
 
 
 def defaults() -> dict[str, Any]:
-    """Every setting's default, by class: what a `run.json` of before it was there means (`pcil.training.config:Run.plain`)."""
+    """Every setting's default, by class, which older `run.json` files rely on (`pcil.training.config:Run.plain`)."""
     kinds = dict.fromkeys([DrQV2, BC, *REWARDS.values()])
     return {kind.__name__: dataclasses.asdict(kind()) for kind in kinds}
 
 
 def made_by() -> dict[str, Any]:
-    """What made the numbers, for whoever finds that they differ."""
+    """The commit, versions and processor that produced the numbers, to explain a difference."""
     root = Path(__file__).parent.parent
     git = ["git", "-C", str(root)]
     commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True).stdout.strip()
@@ -134,7 +134,7 @@ def made_by() -> dict[str, Any]:
 
 
 def rounded(tree: Any) -> Any:
-    """Eight digits: more than a float32 has."""
+    """Round to eight digits, more than a float32 has."""
     if isinstance(tree, dict):
         return {name: rounded(value) for name, value in tree.items()}
     return [rounded(value) for value in tree] if isinstance(tree, list) else float(f"{tree:.8g}")

@@ -1,8 +1,8 @@
-"""Changes one thing in the source at a time and says which changes no test notices: `make mutants FILES="losses noise" N=200`.
+"""Change the source in one place at a time and show the changes that no test notices: `make mutants FILES="losses noise"`.
 
-The changes are Cosmic Ray's, and three of ours: a call removed, two arguments swapped, None returned. Each is made in a copy of
-the source and tested in a process of its own, forked from one that has imported JAX already. `mutants.toml` has the tests that
-guard each file and the changes that are known to make no difference; `docs/mutants.md` has the results.
+The changes are those of Cosmic Ray and three more: a call removed, two arguments swapped, None returned. Each is made in a copy
+of the source and tested in a separate process, forked from one that has already imported JAX. `mutants.toml` has the tests that
+are assigned to each file and the changes that are known to make no difference; `docs/mutants.md` has the results.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ OPERATORS = [
 ]
 HEAVY = ["jax", "equinox", "optax", "gymnasium", "scipy", "hypothesis", "pytest", "beartype", "h5py", "tyro", "minari"]
 HEAVY += ["orbax.checkpoint", "ot", "mujoco"]
-"""What is imported once, so that no child has to; POT alone takes seconds."""
+"""Modules imported once, so that the children need not import them; POT alone takes seconds."""
 LONGEST = 60
-"""Seconds that one test may take: a change can make a loop endless."""
+"""The maximum number of seconds for one test, since a change can make a loop endless."""
 SYMMETRIC = {"minimum", "maximum", "min", "max"}
-"""Functions of two arguments that may be swapped."""
+"""Functions whose two arguments may be swapped."""
 
 
 class Mutant(NamedTuple):
-    """One change of a file: the lines that differ, as they were and as they are, and the whole text."""
+    """One change of a file: the first changed line before and after, and the whole changed text."""
 
     file: str
     number: int
@@ -56,7 +56,7 @@ class Mutant(NamedTuple):
 
 
 class Positions(Visitor):
-    """Where an operator can change a file, in the order in which Cosmic Ray counts."""
+    """The positions at which an operator can change a file, in Cosmic Ray's order."""
 
     def __init__(self, operator: Any) -> None:
         self.operator, self.found = operator, []
@@ -67,13 +67,13 @@ class Positions(Visitor):
 
 
 def annotations(tree: ast.AST) -> list[ast.AST]:
-    """Types, which no test should need to notice."""
+    """Type annotations, whose changes no test needs to notice."""
     found: list[Any] = [getattr(node, name, None) for node in ast.walk(tree) for name in ("annotation", "returns")]
     return [node for node in found if node is not None]
 
 
 def edits(text: str, tree: ast.AST) -> Iterator[tuple[ast.AST, str]]:
-    """Nodes and what our operators put in their place."""
+    """Nodes and their replacements by our operators."""
     source = lambda node: ast.get_source_segment(text, node) or ""  # noqa: E731
     for node in ast.walk(tree):
         if isinstance(node, ast.Return) and node.value is not None and source(node.value) != "None":
@@ -95,7 +95,7 @@ def swaps(call: ast.Call, function: str) -> bool:
 
 
 def mutants(name: str, text: str) -> list[Mutant]:
-    """Every mutant of a file whose text is not the original's or another's."""
+    """Every distinct mutant of a file that differs from the original."""
     tree, lines = ast.parse(text), text.splitlines()
     typed = {(n, c) for node in annotations(tree) for n, c in spots(node)}
     codes: list[str] = []
@@ -122,7 +122,7 @@ def mutants(name: str, text: str) -> list[Mutant]:
 
 
 def spots(node: Any) -> Iterator[tuple[int, int]]:
-    """Lines and columns of a node."""
+    """The positions (line, column) that a node covers."""
     for line in range(node.lineno, node.end_lineno + 1):
         first = node.col_offset if line == node.lineno else 0
         last = node.end_col_offset if line == node.end_lineno else 200
@@ -138,14 +138,14 @@ def parses(code: str) -> bool:
 
 
 class Alarm:
-    """Ends the process where a test takes too long, in compiled code too."""
+    """Ends the process if a test takes too long, even in compiled code."""
 
     def pytest_runtest_logstart(self) -> None:
         signal.alarm(LONGEST)
 
 
 def killed(copy: Path, tests: list[str], limit: float) -> tuple[bool, float]:
-    """Whether one of the tests fails, or takes longer than so many seconds; and how long they took."""
+    """Whether a test fails or the time limit is exceeded, and the time that the tests took."""
     began, child = time.monotonic(), os.fork()
     if child == 0:
         os.setsid()
@@ -179,9 +179,9 @@ def main() -> int:
     guards = {name: [test for word in words for test in wider.get(word, [word])] for name, words in table["guards"].items()}
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("files", nargs="*", help=f"from src/pcil without .py: {', '.join(guards)}; a folder means its files")
-    parser.add_argument("--number", "-n", type=int, help="how many mutants, drawn at random; by default all of them")
+    parser.add_argument("--number", "-n", type=int, help="number of mutants, drawn at random; by default all of them")
     parser.add_argument("--seed", type=int, default=0, help="of the draw")
-    parser.add_argument("--skip", type=int, default=0, help="leave out so many of the first, to go on with a campaign")
+    parser.add_argument("--skip", type=int, default=0, help="skip this number of mutants at the start, to continue a campaign")
     options = parser.parse_args()
     called = {name: {name, *name.split("/")} for name in guards}
     chosen = [name for name in guards if not options.files or called[name] & set(options.files)]
@@ -189,7 +189,7 @@ def main() -> int:
         parser.error(f"no tests guard {', '.join(missing)}; the files are {', '.join(guards)}")
     os.chdir(ROOT)
     os.environ.setdefault("MUJOCO_GL", "disabled")
-    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a change is compiled anew, and then runs for milliseconds
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # a changed program is compiled again
     for heavy in HEAVY:
         importlib.import_module(heavy)
 

@@ -1,4 +1,4 @@
-"""Small environments that do one thing wrong, as real ones do."""
+"""Small environments with one mistake each, as real environments have."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ BOX = spaces.Box(-9.0, 9.0, (2,), np.float64)
 
 
 class Odd(gymnasium.Env):
-    """A point on a line, `[position, goal]`; in step `at` of its episode `episode` the values of `wrong` replace its own.
+    """A point on a line, `[position, goal]`; in step `at` of episode `episode` the values of `wrong` replace its own.
 
-    Of `wrong`, "obs", "reward", "terminated", "truncated" and "info" are parts of what `step` returns, "step" is all of it, and
-    "reset" is what `reset` returns, in that episode. A function is called, so it may raise.
+    The keys "obs", "reward", "terminated", "truncated" and "info" of `wrong` replace parts of the result of `step`, "step"
+    replaces all of it, and "reset" replaces the result of `reset`. A value that is a function is called, so it may raise.
     """
 
     open_copies: ClassVar[list[Odd]] = []
-    """Those that were made and not closed."""
+    """The environments that were made and not closed."""
     once: ClassVar[bool] = False
-    """Only one may be open at a time, as of a simulator that binds a port."""
+    """Whether only one may be open at a time, as for a simulator that binds a port."""
 
     def __init__(self, space: spaces.Space = BOX, at: int = 3, episode: int = 1, steps: int = 10, **wrong: Any) -> None:
         assert not (self.once and self.open_copies), "this environment can be open once only"
@@ -59,7 +59,7 @@ class Odd(gymnasium.Env):
 
 
 def _filled(space: spaces.Space, values: Iterator[float]) -> Any:
-    """The values in a space's structure, from the first part that was given to the last; zeros where there are no more."""
+    """The values arranged in the structure of a space, in order, and zeros when there are no more values."""
     if isinstance(space, spaces.Dict):
         return {key: _filled(part, values) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):

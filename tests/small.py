@@ -1,4 +1,4 @@
-"""Settings small enough for tests: one compilation of narrow networks is shared by every test that uses them."""
+"""Settings small enough for tests: all tests that use them share one compilation of narrow networks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ POINT_MASS = "toy/point_mass-v0"
 
 
 def narrow(settings: Any, **changes: Any) -> Any:
-    """An agent's or a reward's settings with hidden width 16, batches of 32 and frequent turns, where it has them."""
+    """An agent's or a reward's settings, reduced to hidden width 16, batches of 32 and short periods where it has these."""
     small = {"hidden": 16, "batch_size": 32, "feature_dim": 8, "noise": LinearSchedule(1.0, 0.1, 1000)}
     small |= {"refresh": 30, "every": 2} | changes
     names = {field.name for field in dataclasses.fields(settings)}
@@ -64,17 +64,17 @@ def random_batch(rows: int, obs_dim: int, action_dim: int, seed: int = 0) -> Bat
 
 
 def staying(obs: np.ndarray, action: np.ndarray) -> Batch:
-    """Steps that lead to where they begin, so that a test need not say which of the two states it means."""
+    """Steps that end in the state in which they begin, so that a test need not distinguish the two."""
     return Batch(obs, action, obs)
 
 
 def batches(batch: Batch, n: int = 1) -> Batch:
-    """`windows` as rewards are given them."""
+    """`windows` in the form that rewards are given."""
     return learner.steps(windows(batch, n))
 
 
 def windows(batch: Batch, n: int = 1) -> Window:
-    """Every window of `n` steps of these rows, as if they were one episode without rewards; the last row ends it."""
+    """Every window of `n` steps of these rows, treated as one episode without rewards that ends with the last row."""
     starts = np.arange(len(batch.obs) - n)
     steps = starts[:, None] + np.arange(n + 1)
     ones = np.ones((len(starts), n), np.float32)

@@ -1,4 +1,4 @@
-"""How JAX starts: what can't go on is one sentence, what can is one line, and what needs no device starts none."""
+"""Starting JAX: fatal problems are one sentence, others one line, and commands that need no device start none."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ START = "from pcil import compilation; compilation.start(); print('started')"
 
 
 def run(words: list[str], tmp_path: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """A process of its own in which a plugin of JAX fails, as CUDA's does where there is no GPU."""
+    """Run a process in which a plugin of JAX fails, as CUDA's does without a GPU."""
     plugin = tmp_path / "site" / "jax_plugins" / "failing"
     plugin.mkdir(parents=True)
     (plugin / "__init__.py").write_text("def initialize():\n    raise RuntimeError('no device\\nwas found')\n")

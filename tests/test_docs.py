@@ -1,4 +1,4 @@
-"""The docs say what the code does: names exist, tables equal the settings, the example runs, pages are fresh."""
+"""The docs agree with the code: names exist, tables match the settings, examples run, generated pages are up to date."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def settings_tables() -> list[tuple[str, list[list[str]]]]:
 
 
 def flat(settings: Any, prefix: str = "") -> dict[str, Any]:
-    """Every setting by its name on the command line, nested ones with dots."""
+    """Every setting by its name on the command line; nested names have dots."""
     values = {}
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
@@ -123,7 +123,7 @@ def of(run: Run, kind: str) -> dict[str, Any]:
 
 
 def cell_value(cell: str, task: str) -> Any:
-    """What a cell says for a task: `3; walker 1` is 1 for the walker and 3 for others."""
+    """The value of a cell for a task: `3; walker 1` is 1 for walker tasks and 3 for others."""
     general, _, special = cell.partition("; walker ")
     return ast.literal_eval(special if special and task.startswith("walker") else general)
 
@@ -135,7 +135,7 @@ def made_of(method: str) -> tuple[str, str]:
 
 
 def test_the_settings_tables_say_what_the_code_says() -> None:
-    """Every field is there, and its default and its value in each preset are as written."""
+    """Every field is listed with its default and its value in each preset."""
     tables = settings_tables()
     assert sorted(kind for kind, _ in tables) == sorted([*CLASSES, "Run"])
     bare = {name: kind() for name, kind in CLASSES.items()}
@@ -163,7 +163,7 @@ def load_example(folder: Path, monkeypatch: pytest.MonkeyPatch) -> type[Reward]:
 
 
 def test_the_example_reward_is_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against a naive second computation; 0 at an expert state, and states come back from a checkpoint."""
+    """Compared with a naive second computation; it is 0 at an expert state, and its state can be restored from a checkpoint."""
     settings = load_example(tmp_path, monkeypatch)(num_states=10)
     demos, states = random_batch(40, 3, 1, seed=1), random_batch(7, 3, 1, seed=2)
 
@@ -183,7 +183,7 @@ def test_the_example_reward_is_what_it_says(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_the_example_reward_goes_through_the_compiled_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same `init`, `update` and `label_episode` that train PCIL; the agent is trained on what the example pays."""
+    """It uses the same `init`, `update` and `label_episode` as PCIL, and the agent is trained on the example's rewards."""
     settings = narrow(load_example(tmp_path, monkeypatch)())
     run = dataclasses.replace(small_run(), reward=settings)
     demos, rows, n = random_batch(50, 2, 2), run.agent.batch_size, run.agent.n_step
@@ -203,7 +203,7 @@ def test_the_example_reward_goes_through_the_compiled_step(tmp_path: Path, monke
 def test_the_example_agent_clones_the_expert_and_leaves_a_policy_that_loads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By the command that the page gives. The policy's file names its class, so without `--trust` it is refused."""
+    """Uses the command on the page. The policy's file names its class, so it is refused without `--trust`."""
     _, text = blocks(ROOT / "docs" / "architecture.md", "python")
     (Path.cwd() / "cloning_example.py").write_text(text)
     demos = save_point_mass_demos(tmp_path)
@@ -216,12 +216,12 @@ def test_the_example_agent_clones_the_expert_and_leaves_a_policy_that_loads(
     assert cli.main(["evaluate", "run"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
     assert cli.main(["evaluate", "run", "--episodes", "2", "--trust", "cloning_example"]) == 0
     policy, obs = pcil.load_policy("run", ["cloning_example"]), np.ones((3, 2), np.float32)
-    assert (np.diag(policy.actor.weight) < -0.1).all(), "the expert steers to the origin"
+    assert (np.diag(policy.actor.weight) < -0.1).all(), "the expert moves towards the origin"
     assert np.allclose(policy(obs), np.tanh(obs @ policy.actor.weight)) and policy.spec[:2] == (2, 2)
 
 
 def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`python docs/make_cli.py` mends it."""
+    """If this fails, run `python docs/make_cli.py`."""
     spec = importlib.util.spec_from_file_location("make_cli", ROOT / "docs" / "make_cli.py")
     assert spec is not None and spec.loader is not None
     make_cli = importlib.util.module_from_spec(spec)
@@ -246,7 +246,7 @@ def test_the_map_in_the_readme_has_every_file_once() -> None:
 
 
 def test_the_python_in_the_docs_is_python() -> None:
-    """It compiles, and what it takes from `pcil` is there."""
+    """It compiles, and the names that it uses from `pcil` exist."""
     for page in PAGES:
         for text in blocks(page, "python"):
             tree = ast.parse(text)
@@ -255,6 +255,6 @@ def test_the_python_in_the_docs_is_python() -> None:
 
 
 def test_the_tables_of_results_are_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Filled from results/*.csv and what ships, by the command that the page names."""
+    """They are filled from results/*.csv and the included demonstrations by the command on the page."""
     monkeypatch.syspath_prepend(ROOT / "experiments")
     assert importlib.import_module("results").main(["--check"]) == 0, "run python experiments/results.py"

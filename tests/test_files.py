@@ -1,4 +1,4 @@
-"""Locks follow no link, empty nothing, end with their process and say why they fail; text and JSON are read within limits."""
+"""Locks follow no link, empty no file, end with their process and explain failures; text and JSON are read within limits."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_what_lies_in_a_locked_file_stays(tmp_path: Path) -> None:
 
 
 def test_a_link_is_refused_and_what_it_names_stays_by_every_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Also one that leads nowhere: nothing is made where it points to."""
+    """This includes a dangling link, whose target is not created."""
     (tmp_path / "precious.txt").write_text("keep me\n")
     for folder, target in (("linked", "precious.txt"), ("dangling", "nowhere")):
         (tmp_path / folder).mkdir()
@@ -138,7 +138,7 @@ def test_where_a_lock_can_not_be_made_the_reason_is_said(number: int, tmp_path: 
 
 
 def test_every_module_imports_without_what_windows_lacks() -> None:
-    """In a process of its own, without the modules, signals and functions that Unix alone has."""
+    """Runs in a separate process, without the modules, signals and functions that only Unix has."""
     result = subprocess.run([sys.executable, "-W", "ignore", "-c", WINDOWS], capture_output=True, text=True)
     assert (result.stdout, result.stderr) == ("all\n", "")
 
@@ -250,7 +250,7 @@ def test_a_policy_of_infinitely_many_layers_is_damaged(finished: Path, tmp_path:
 
 
 def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
-    """While it trains, the same lock is taken; afterwards it is free."""
+    """While the run trains, its lock is taken; afterwards it is free."""
     seen = []
 
     class Looks(Callback):
@@ -272,11 +272,11 @@ def test_the_lock_of_a_run_is_the_one_that_is_tested(tmp_path: Path) -> None:
         assert free
 
 
-# --- No room ---
+# --- No space left ---
 
 
 def limited(size: int, words: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
-    """A command in a process that may make no file larger than so many bytes."""
+    """Run a command in a process with a limit on file size."""
     code = "import resource, sys; from pcil import cli\n"
     code += f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size}, {size})); sys.exit(cli.main(sys.argv[1:]))"
     return subprocess.run(
@@ -287,7 +287,7 @@ def limited(size: int, words: list[str], **environment: str) -> subprocess.Compl
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no limit on the size of a file")
 def test_whatever_can_not_be_written_any_more_is_one_sentence_and_nothing_is_lost(tmp_path: Path) -> None:
-    """From the first file to the checkpoint, the curve, a recording and a report; without a limit each then ends well."""
+    """From the first file to the checkpoint, the curve, a recording and a report; without the limit each then succeeds."""
     train = "train toy/point_mass-v0 --method expert --frames 200 --seed-frames 100 --random-frames 100 --evaluate-every 100"
     train += " --evaluate-episodes 2 --agent.hidden 16 --agent.batch-size 32 --agent.feature-dim 8 --checkpoint-seconds 0"
     commands = {

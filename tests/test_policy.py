@@ -1,4 +1,4 @@
-"""Laws of a saved policy: it acts exactly as before, and files that are damaged are refused in one sentence."""
+"""A saved policy acts exactly as before, and damaged files are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ INFO = {"method": "pcil", "frames": 2000, "seed": 1, "action_repeat": 2, "return
 
 
 def make_policy(seed: int = 0) -> Policy:
-    """Every number of the actor random, so that no two arrays are alike."""
+    """A policy whose actor has random numbers everywhere, so that no two arrays are equal."""
     rng = np.random.default_rng(seed)
     actor = Actor.init(OBS_DIM, ACTION_DIM, 7, 8, key=jax.random.key(seed))
     actor = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), actor)
@@ -45,12 +45,12 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(saved: Path, tmp_path: Path) -> Path:
-    """A copy that may be damaged."""
+    """A copy that a test may damage."""
     return Path(shutil.copytree(saved, tmp_path / "mine"))
 
 
 def refusal(call: Callable) -> str:
-    """The message of the `InputError` that `call` must raise; it must be one sentence."""
+    """The message of the `InputError` that `call` must raise, which must be one sentence."""
     with pytest.raises(InputError) as caught:
         call()
     message = str(caught.value)
@@ -146,7 +146,7 @@ def test_the_observation_is_not_written_to() -> None:
 
 @pytest.fixture
 def _as_users_run_it() -> Iterator[None]:
-    """Without the checks of shapes that the test run adds, which would refuse some damage before the policy looks at it."""
+    """Turn off the shape checks of the test run, which would refuse some damage before the policy does."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
@@ -232,7 +232,7 @@ def test_where_there_is_no_policy_the_sentence_says_what_to_give(folder: Path, m
 @pytest.mark.usefixtures("_as_users_run_it")
 @pytest.mark.parametrize("name", ["policy.safetensors", "policy.json"])
 def test_a_flipped_bit_is_refused_or_changes_no_action(folder: Path, name: str) -> None:
-    """A bit of the values, of their checksum or of a name is noticed; one of the task or of the info leaves the same policy."""
+    """A flipped bit in the values, their checksum or a name is noticed; in the task or the info it leaves the same policy."""
     file, obs = folder / name, observations(OBS_DIM)
     action, whole, refused = load_policy(folder)(obs), file.read_bytes(), 0
     for at in range(0, len(whole), 3):
@@ -247,7 +247,7 @@ def test_a_flipped_bit_is_refused_or_changes_no_action(folder: Path, name: str) 
 
 
 def test_a_file_without_a_checksum_is_read(folder: Path) -> None:
-    """Another program may have written it."""
+    """It may have been written by another program."""
     policy = load_policy(folder)
     edit_arrays(folder, lambda a: None)
     np.testing.assert_array_equal(load_policy(folder)(observations(OBS_DIM)), policy(observations(OBS_DIM)))

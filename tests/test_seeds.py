@@ -1,4 +1,4 @@
-"""Laws of randomness: a draw is a function of its seed, its stream and its counter, and of nothing else."""
+"""A random draw is a function of its seed, its stream and its counter only."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def jax_numbers(seed: int, stream: Stream, counter: int) -> tuple[int, ...]:
 
 
 def test_the_streams_numbers_stay_what_they_were() -> None:
-    """Every published result depends on them: a new stream is added at the end, and this table with it."""
+    """Every published result depends on them. A new stream is added at the end, and to this table."""
     assert {stream.name: stream.value for stream in Stream} == {
         "INIT_AGENT": 0,
         "INIT_REWARD": 1,
@@ -39,7 +39,7 @@ def test_the_streams_numbers_stay_what_they_were() -> None:
 
 
 def test_the_draws_stay_what_they_were() -> None:
-    """The first is NumPy's own: `SeedSequence((1, 2, 3)).generate_state(1)[0] >> 1`; the second is `fold_in` written out."""
+    """The first value is `SeedSequence((1, 2, 3)).generate_state(1)[0] >> 1` in NumPy; the second is `fold_in` written out."""
     assert seeds.episode_seed(1, Stream.EPISODE, 3) == int(np.random.SeedSequence((1, 2, 3)).generate_state(1)[0]) // 2
     root = jax.random.key(1)
     expected = jax.random.key_data(jax.random.fold_in(jax.random.fold_in(root, 5), 7))
@@ -64,7 +64,7 @@ def test_neighbouring_seeds_streams_and_counters_are_all_different(draw) -> None
 
 
 def test_streams_share_no_number_however_long_they_are_drawn_from() -> None:
-    """Nor do the episodes of one: 64-bit draws of independent streams meet by chance once in 10^11 such tests."""
+    """Nor do the episodes of one stream. Equal 64-bit draws would occur by chance once in 10^11 such tests."""
     drawn = [
         seeds.rng(1, stream, episode).integers(2**64, size=500, dtype=np.uint64) for stream in Stream for episode in range(3)
     ]

@@ -1,4 +1,4 @@
-"""What holds for the source as a whole: who imports whom, how long files are, and what must not appear in them."""
+"""Rules for the whole source: imports between packages, the length of files, and words that must not appear in them."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ LAYERS = [
     "report theory bench",
     "sweep cli",
 ]
-"""A room, or a file beside the rooms, imports from its own layer and those above it in this list."""
+"""A package, or a file beside the packages, imports only from its own layer and from earlier layers in this list."""
 LAYER = {room: depth for depth, rooms in enumerate(LAYERS) for room in rooms.split()}
 ROLLING_OUT = {"representation", "film"}
-"""The files of `report` that load JAX and play episodes."""
+"""The modules of `report` that load JAX and play episodes."""
 LOADERS = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
-"""Modules that run code out of a file which they read."""
+"""Modules that may run code from a file that they read."""
 
 
 def room(path: Path) -> str:
-    """The room, or the file beside the rooms, that a file is."""
+    """The package that a file is in, or the file's own name if it is beside the packages."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
@@ -49,7 +49,7 @@ def name(path: Path) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Full names of all that a file imports, at its top and inside its functions."""
+    """Full names of everything that a file imports, at the top and inside functions."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -59,7 +59,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def rooms_imported(path: Path) -> set[str]:
-    """The rooms that a file imports from."""
+    """The packages that a file imports from."""
     return {word.split(".")[1] for word in imported(path) if word.startswith("pcil.")}
 
 
@@ -91,7 +91,7 @@ def test_agents_and_rewards_know_nothing_of_each_other() -> None:
 
 
 def test_the_report_imports_no_jax() -> None:
-    """In a fresh process, so that what its imports import counts too; it takes nothing of the package but the error, the
+    """In a new process, so that indirect imports count too. From the package it imports only the error, the
     readers of files and the theory."""
     static = [path for path in SOURCES if room(path) == "report" and path.stem not in ROLLING_OUT]
     code = f"import sys, {', '.join(map(name, static))}; print(*sorted(sys.modules))"
@@ -125,17 +125,17 @@ def test_public_names_are_those_that_load() -> None:
     for name in pcil.__all__:
         module, attribute = pcil._HOME[name]
         assert getattr(pcil, name) is getattr(sys.modules[module], attribute)
-        assert getattr(pcil, name).__doc__, f"pcil.{name} says what it is"
+        assert getattr(pcil, name).__doc__, f"pcil.{name} has a docstring"
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = pcil.nothing
 
 
 TEXT = {tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
-"""Kinds of tokens that hold words of strings; from Python 3.12 on an f-string is several tokens."""
+"""Kinds of tokens that hold the text of strings; since Python 3.12 an f-string is several tokens."""
 
 
 def code_words(path: Path) -> Iterator[tuple[int, str]]:
-    """Line and word of identifiers and strings; comments, docstrings and the package's own name in imports are left out."""
+    """Line and word of identifiers and strings, without comments, docstrings and the package's own name in imports."""
     tree = ast.parse(path.read_text())
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
     docs = {node.body[0].lineno for node in ast.walk(tree) if isinstance(node, documented) and ast.get_docstring(node)}
@@ -155,9 +155,9 @@ GENERAL += [PACKAGE / f"agents/{file}.py" for file in ("base", "drqv2")]
 
 @pytest.mark.parametrize("path", GENERAL, ids=lambda path: path.stem)
 def test_the_loop_and_the_agents_name_no_method(path: Path) -> None:
-    """No method's name in a string; none, and no reward's class, as an identifier.
+    """No string contains the name of a method, and no identifier is the name of a method or of a reward's class.
 
-    `expert` alone may be an identifier: there it is the batch of expert steps, which every method is given.
+    The only exception is the identifier `expert`, which is the batch of expert steps that every method is given.
     """
     methods = set(presets.METHODS)
     classes = {kind.__name__.lower() for kind in REWARDS.values()}
@@ -166,7 +166,7 @@ def test_the_loop_and_the_agents_name_no_method(path: Path) -> None:
 
 
 def test_the_search_for_names_finds_them(tmp_path: Path) -> None:
-    """The search of the test above is no empty one."""
+    """The search used by the test above finds such names."""
     lines = [
         '"""pcil."""',
         "from pcil import loop",

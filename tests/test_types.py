@@ -1,4 +1,4 @@
-"""Laws of the values that cross the seams: an episode and its absorbing state."""
+"""Values that are passed between packages: an episode and its absorbing state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_an_absorbed_episode_never_terminates_and_pays_the_same(steps: int, term
     after = episode.absorbed(rest)
     assert not after.terminated and after.seed == 3 and after.total_reward == episode.total_reward
     assert len(after) == steps + terminated * rest and after.obs.shape[1] == 3
-    real = steps if terminated else steps + 1  # observations that are kept
+    real = steps if terminated else steps + 1  # number of observations that are kept
     assert np.array_equal(after.obs[:real, :2], episode.obs[:real]) and not after.obs[:real, 2].any()
     assert np.array_equal(after.action[:steps], episode.action) and np.array_equal(after.reward[:steps], episode.reward)
     if terminated:

@@ -1,4 +1,4 @@
-"""Behavioural cloning: its likelihood by SciPy, its gradient by differences, and a run without an environment's step."""
+"""Behavioural cloning: its likelihood by SciPy, its gradient by differences, and a run without environment steps."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_an_update_uses_the_first_step_of_a_window_and_nothing_else() -> None:
 def test_a_run_clones_the_optimal_policy_without_a_step_in_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its steps are counted in evaluations only; after 1200 updates its actions are the expert's."""
+    """The environment is stepped only in evaluations; after 1200 updates the actions are close to the expert's."""
     demos = save_point_mass_demos(tmp_path)
     played = []
     monkeypatch.setattr(loop, "play", lambda *_: played.append(1))
@@ -70,7 +70,7 @@ def test_a_run_clones_the_optimal_policy_without_a_step_in_the_environment(
 
 
 def test_an_update_reads_the_first_step_of_a_window_and_no_other() -> None:
-    """Whatever follows it, and however long the window is."""
+    """The following steps and the length of the window have no effect."""
     key, batch = jax.random.key(0), random_batch(40, 3, 2)
     state = AGENT.init(Spec(3, 2, 1), key=key)
     one, three = windows(batch, 1), windows(batch, 3)

@@ -1,4 +1,4 @@
-"""The agent: its equations by hand, and five probe environments that each catch one class of bug."""
+"""The agent: its equations by hand, and five probe environments, each of which detects one class of bug."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_slow_critic_moves_by_tau_and_the_trunk_with_it() -> None:
 
 
 def test_actor_update_leaves_the_critic_alone_and_raises_its_value() -> None:
-    """The critic's gradient comes from its own loss only; a small step of the actor's raises min(Q1, Q2)."""
+    """The critic's gradient comes only from its own loss; a small step of the actor raises min(Q1, Q2)."""
     state, window = AGENT.init(SPEC, key=jax.random.key(0)), make_window()
     obs, noise = jnp.asarray(window.obs[:, 0]), jnp.zeros((32, 2))
     loss, gradient = jax.value_and_grad(AGENT.actor_loss)(state.actor, state.critic, obs, noise, jnp.ones(32))
@@ -106,7 +106,7 @@ def trained_on(task: str, folder: Path, frames: int = 1200) -> loop.State:
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4, 5])
 def test_probe_environments(number: int, tmp_path: Path) -> None:
-    """Each probe's known values are learned, and the known best actions where it has any."""
+    """The known values of each probe are learned, and the known best actions if it has any."""
     state = trained_on(f"toy/probe_{number}-v0", tmp_path / "run")
     probe = envs.make(f"toy/probe_{number}-v0").unwrapped
     starts = {1: (0.0,), 2: (-1.0, 1.0), 3: (0.0, 1.0), 4: (0.0,), 5: (-1.0, 1.0)}[number]
@@ -121,7 +121,7 @@ def test_probe_environments(number: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_task_reward_agent_solves_the_point_mass(tmp_path: Path) -> None:
-    """Within 10% of the optimal policy's return from the same starts; the trunk's normalisation blurs the last stretch."""
+    """Within 10% of the optimal return from the same starts; the trunk's normalisation limits accuracy near the goal."""
     agent = narrow(DrQV2(), hidden=64, learning_rate=1e-3, batch_size=64)
     run = small_run("expert", frames=6000, evaluate_every=6000, evaluate_episodes=10, agent=agent)
     result = runs.execute(run, tmp_path / "run")
@@ -142,7 +142,7 @@ def optimal_return(env: gymnasium.Env, seed: int) -> float:
 
 
 def test_the_actor_that_leaves_acts_on_plain_observations() -> None:
-    """Large units, far from zero: what acts is the network on standardised observations."""
+    """With large units, far from zero, the network acts on standardised observations."""
     agent = dataclasses.replace(AGENT, normalize_observations=True)
     state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
     window = window._replace(obs=window.obs * jnp.array([[[1.0, 30.0, 0.01]]]) + jnp.array([[[0.0, -50.0, 2.0]]]))

@@ -1,4 +1,4 @@
-"""DrQ-v2's whole update beside a second implementation in float64, written from its definitions, and its noise over time."""
+"""DrQ-v2's update compared with a second implementation in float64, written from the definitions; its noise over time."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from small import narrow, random_batch
 SPEC = Spec(3, 2, 1)
 AGENT = narrow(DrQV2(), n_step=2, learning_rate=0.01, tau=0.2, gamma=0.9, noise=LinearSchedule(1.0, 0.1, 1000), noise_clip=0.3)
 DEVIATION = {0: 1.0, 500: 0.55, 1000: 0.1, 5000: 0.1}
-"""Of the noise, by hand: `1 - 0.9 step / 1000`, and 0.1 from step 1000 on."""
+"""Standard deviations of the noise, by hand: `1 - 0.9 step / 1000`, and 0.1 after step 1000."""
 
 
 def window(seed: int) -> Window:
-    """32 windows of two steps; of each four, the first ends with its first step and the second with its last."""
+    """32 windows of two steps; of each four, the first terminates at its first step and the second at its last."""
     rng = np.random.default_rng(seed)
     flat = random_batch(32 * 3, 3, 2, seed)
     discount = np.ones((32, 2), np.float32)
@@ -50,7 +50,7 @@ def layers(mlp: MLP, x: Any) -> Any:
 
 
 def noisy(actor: Any, obs: Any, noise: Any) -> Any:
-    """The clamp is to 1 - 1e-6, and its gradient is that of the mean alone."""
+    """The action is clamped to 1 - 1e-6, with the gradient of the mean alone."""
     mean = jnp.tanh(layers(actor.head, features(actor.trunk, obs)))
     return mean + jax.lax.stop_gradient(jnp.clip(mean + noise, -1 + 1e-6, 1 - 1e-6) - mean)
 
@@ -69,7 +69,7 @@ def adam(network: Any, slope: Any, first: Any, second: Any, count: Any) -> tuple
 
 @jax.jit
 def naive(nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, count: Any) -> tuple[dict[str, Any], Any]:
-    """Update number `count`: target, critic's step, actor's on that critic, slow critic. The losses are the second result."""
+    """Update number `count`: target, critic step, actor step on the new critic, slow critic. Returns networks and losses."""
     nets = dict(nets)
     s0, s2, a0 = w.obs[:, 0], w.obs[:, 2], w.action[:, 0]
     r, d = w.reward, w.discount
@@ -98,7 +98,7 @@ def close(got: Any, expected: Any, name: str) -> None:
 
 
 def test_three_updates_equal_the_definitions_in_float64() -> None:
-    """At three steps of the noise's schedule; Adam's first opt_state show each gradient's size, which its first step hides."""
+    """At three steps of the noise schedule. Adam's state shows the size of each gradient, which its first step does not."""
     state = AGENT.init(SPEC, key=jax.random.key(0))
     steps, keys = (0, 500, 5000), [jax.random.key(10 + i) for i in range(3)]
     draws = [jax.random.normal(key, (2, 32, 2)) for key in keys]
@@ -136,8 +136,8 @@ def resting() -> Actor:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_acting_noise_follows_the_schedule(correlation: float) -> None:
-    """One generator, the same draws: at each step they are as many times larger as the schedule says, with no other bound than
-    the action's."""
+    """With the same draws of one generator, the noise at each step is scaled by the schedule, and bounded only by
+    the action's bounds."""
     agent = dataclasses.replace(AGENT, noise_correlation=correlation)
     alone = dataclasses.replace(agent, noise=LinearSchedule(0.1, 0.1, 1))
     obs, large = np.zeros(3, np.float32), 0
@@ -146,7 +146,7 @@ def test_acting_noise_follows_the_schedule(correlation: float) -> None:
         got, tenth = explore(resting(), obs, step), unit(resting(), obs, 0)
         assert np.allclose(got, np.clip(10 * DEVIATION[step] * tenth, -1 + 1e-6, 1 - 1e-6), atol=1e-5)
         large += int((np.abs(got) > 0.3).sum())
-    assert large > 10, "noise_clip bounds the updates alone"
+    assert large > 10, "noise_clip bounds only the updates"
 
 
 def test_white_acting_noise_is_the_schedules_deviation_times_the_generators_draws() -> None:
@@ -158,7 +158,7 @@ def test_white_acting_noise_is_the_schedules_deviation_times_the_generators_draw
 
 
 def test_the_noise_of_updates_follows_the_schedule_and_its_two_draws_are_independent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the target and the actor's loss are given, unclipped: 1000 draws each, of the deviation that the step has."""
+    """The unclipped noise of the target and of the actor's loss: 1000 draws each, with the standard deviation of the step."""
     agent = dataclasses.replace(AGENT, noise_clip=100.0, batch_size=500)
     given: dict[str, Any] = {}
     target, actor_loss = DrQV2.target, DrQV2.actor_loss

@@ -1,4 +1,4 @@
-"""The benchmark measures what it says: the floor is the update's own matrix products, all of them and nothing else."""
+"""The benchmark's lower bound consists of exactly the update's own matrix products."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DESIGN = """
     update_ms, floor_ms, agent_update_ms, agent_floor_ms, env_step_us, physics_us, act_us, sample_us,
     loop_update_share, frames_per_second
 """
-"""Section 5 of the design."""
+"""The keys of `pcil bench --json`."""
 
 
 def layers() -> tuple[Array, Array]:
@@ -37,18 +37,18 @@ def layers() -> tuple[Array, Array]:
 
 
 def loss(weights: tuple[Array, Array], x: Float[Array, "batch in"]) -> Float[Array, ""]:
-    """A network of two layers; the first is in a compiled function of its own."""
+    """The loss of a network with two layers, the first in a separate compiled function."""
     hidden = jax.jit(lambda w, x: jnp.tanh(x @ w))(weights[0], x)
     return jnp.sum((hidden @ weights[1]) ** 2)
 
 
 def products(function: Any, *arguments: Any) -> list[Any]:
-    """The matrix products that the benchmark sees in a function."""
+    """The matrix products that the benchmark finds in a function."""
     return list(bench._dot_generals(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 
 def flops(equation: Any) -> int:
-    """Two for each multiplication: twice the size of the result times the length of what is summed over."""
+    """Two for each multiplication: twice the size of the result times the length of the summed axis."""
     (contracted, _), _ = equation.params["dimension_numbers"]
     return 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(equation.invars[0].aval.shape[i] for i in contracted)
 
@@ -65,7 +65,7 @@ def test_products_are_found_in_compiled_functions() -> None:
 
 
 def test_products_are_found_in_gradients() -> None:
-    """Backwards, each layer costs one product for its weights and one for its input; the first input needs none."""
+    """In the backward pass each layer needs one product for its weights and one for its input, except for the first input."""
     found = products(jax.value_and_grad(loss), layers(), jnp.ones((BATCH, WIDTHS[0])))
     assert len(found) == 5
     assert sum(map(flops, found)) == 2 * 2 * BATCH * 3 * 7 + 3 * 2 * BATCH * 7 * 2
@@ -77,7 +77,7 @@ def test_other_operations_are_no_products() -> None:
 
 
 def test_the_floor_is_the_same_products() -> None:
-    """Equal shapes, equal operations, equal FLOPs; and none is merged with another or left out by the compiler."""
+    """Shapes, operations and FLOPs are equal, and the compiler neither merges nor removes any product."""
     found = products(jax.value_and_grad(loss), layers(), jnp.ones((BATCH, WIDTHS[0])))
     floor = bench._products(found)
     again = products(floor)
@@ -89,7 +89,7 @@ def test_the_floor_is_the_same_products() -> None:
 
 
 def test_equal_products_are_each_computed() -> None:
-    """Two layers of the same shape do not become one."""
+    """Two layers of the same shape are not merged."""
     x, w = jnp.ones((4, 4)), jnp.ones((4, 4))
     found = products(lambda x, w: (x @ w, jnp.tanh(x) @ w), x, w)
     first, second = bench._products(found)()
@@ -119,9 +119,9 @@ def update_products(run: Run, spec: Spec) -> list[Any]:
 def test_the_agents_update_has_the_products_that_it_must(preset: str) -> None:
     """Counted by hand: trunks t, the actor's head a, the critic's two heads c.
 
-    The target runs actor and slow critic. The critic's loss runs it forwards, and backwards for all weights and for the inputs
-    of its heads. The actor's loss runs both forwards, backwards through the critic's heads, then for the actor's weights and
-    the inputs of its head. At the paper's sizes that makes the 0.33 GFLOP of the design, section 6.
+    The target runs the actor and the slow critic. The critic's loss runs it forwards, and backwards for all weights and for the
+    inputs of its heads. The actor's loss runs both forwards, backwards through the critic's heads, then for the actor's weights and
+    the inputs of its head. At the paper's sizes this is 0.33 GFLOP.
     """
     run, spec = presets.make("walker_walk", "expert", preset), Spec(24, 6, 2)
     hidden, features = run.agent.hidden, run.agent.feature_dim
@@ -135,7 +135,7 @@ def test_the_agents_update_has_the_products_that_it_must(preset: str) -> None:
 
 
 def test_pcils_update_costs_what_the_design_says() -> None:
-    """About 0.8 GFLOP at the paper's sizes, the agent's included (design, section 6)."""
+    """About 0.8 GFLOP at the paper's sizes, including the agent's."""
     total = sum(map(flops, update_products(presets.make("walker_walk", "pcil", "paper"), Spec(24, 6, 2))))
     assert total == pytest.approx(0.8e9, rel=0.1)
 

@@ -120,8 +120,8 @@ def test_the_agents_update_has_the_products_that_it_must(preset: str) -> None:
     """Counted by hand: trunks t, the actor's head a, the critic's two heads c.
 
     The target runs the actor and the slow critic. The critic's loss runs it forwards, and backwards for all weights and for the
-    inputs of its heads. The actor's loss runs both forwards, backwards through the critic's heads, then for the actor's weights and
-    the inputs of its head. At the paper's sizes this is 0.33 GFLOP.
+    inputs of its heads. The actor's loss runs both forwards, backwards through the critic's heads, then for the actor's weights
+    and the inputs of its head. At the paper's sizes this is 0.33 GFLOP.
     """
     run, spec = presets.make("walker_walk", "expert", preset), Spec(24, 6, 2)
     hidden, features = run.agent.hidden, run.agent.feature_dim

@@ -1,4 +1,4 @@
-"""The command line: what is wrong is one sentence and exit code 2, and nothing is written; what is right goes end to end."""
+"""The command line: bad input gives one sentence and exit code 2 and writes nothing; valid commands work from end to end."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ NARROW = """
     --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --agent.hidden 16
     --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
 """
-"""`small.small_run` in words, so that both share one compilation."""
+"""`small.small_run` as command-line arguments, so that both share one compilation."""
 reset = PointMass.reset
 
 
 def narrow_run(demos: str, out: str | Path) -> list[str]:
-    """The words that train it."""
+    """The command that trains it."""
     return ["train", POINT_MASS, "--demos", demos, *NARROW.split(), "--out", str(out)]
 
 
@@ -50,7 +50,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def trained(demos: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A finished run, and what its training printed."""
+    """A finished run, and the output of its training."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     with contextlib.redirect_stdout(io.StringIO()) as output:
         assert cli.main(narrow_run(demos, folder)) == 0
@@ -59,17 +59,17 @@ def trained(demos: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
 
 @pytest.fixture
 def run(trained: tuple[Path, str], tmp_path: Path) -> Path:
-    """A copy of the finished run that may be damaged, as `run` in the present folder."""
+    """A copy of the finished run that a test may damage, as `run` in the current folder."""
     return Path(shutil.copytree(trained[0], tmp_path / "run"))
 
 
 def files(folder: Path) -> dict[str, bytes | None]:
-    """Everything below `folder`; the value of a folder is None."""
+    """The content of every file below `folder`; the value of a folder is None."""
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What the command says as it refuses: one sentence on standard error alone, with every file as it was."""
+    """The message with which the command refuses: one sentence, only on standard error. No file is changed."""
     before = files(Path.cwd())
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
@@ -104,7 +104,7 @@ def test_an_unknown_preset_names_the_presets(capsys: pytest.CaptureFixture[str])
 
 
 TRAIN = [
-    # words after `train`, what the sentence must hold
+    # arguments after `train`, text that the message must contain
     ("--out new", "The task is missing"),
     ("walker_walk", "Missing from pcil train: --out PATH"),
     ("walker_walk --out", "Missing value for argument '--out'"),
@@ -215,7 +215,7 @@ def test_recording_never_overwrites_a_dataset(run: Path, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(("encoding", "columns"), [("utf-8", "200"), ("utf-8", "40"), ("ascii", "40")])
 def test_a_refusal_is_the_same_on_every_terminal(encoding: str, columns: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """tyro draws its box by the terminal's width, encoding and colours; none of that may reach the sentence."""
+    """tyro draws a box that depends on the terminal's width, encoding and colours; these must not affect the message."""
 
     class Terminal(io.TextIOWrapper):
         def isatty(self) -> bool:
@@ -230,7 +230,7 @@ def test_a_refusal_is_the_same_on_every_terminal(encoding: str, columns: str, mo
     assert err.getvalue() == f"pcil: {options}; pcil train --help tells more.\n"
 
 
-# --- What the words mean ---
+# --- What the arguments mean ---
 
 
 def test_options_are_seen_before_they_are_parsed() -> None:
@@ -292,7 +292,7 @@ def test_train_help_shows_the_settings_of_the_method(
 def test_a_reward_of_ones_own_brings_its_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One that needs whole episodes can be had with `--label stored`, and is refused with the default label."""
+    """A reward that needs whole episodes is accepted with `--label stored`, and refused with the default label."""
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
     (tmp_path / "reward_of_mine.py").write_text(
         "from dataclasses import dataclass\n"
@@ -339,7 +339,7 @@ def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) ->
 
 
 def test_the_settings_of_another_run_train_the_same_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From its `run.json`, and from what that holds as one argument; the folder of the run itself is done."""
+    """From its `run.json`, and from the content of that file as an argument; in the run's own folder, it is finished."""
     assert cli.main(["train", "--settings", str(run / "run.json"), "--out", str(run)]) == 0
     assert "is done" in capsys.readouterr().out
     settings = json.dumps(json.loads((run / "run.json").read_text())["run"])
@@ -422,7 +422,7 @@ def test_what_is_recorded_can_be_trained_from(run: Path, tmp_path: Path, capsys:
 
 
 def test_a_report_of_a_run_is_a_page(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With its representation; point mass has no pictures, which is said. The run is left as it was."""
+    """The page includes its representation, and says that the point mass has no pictures. The run is not changed."""
     before = files(run)
     assert cli.main(["report", str(run), "--out", "report"]) == 0
     note, said = capsys.readouterr().out.splitlines()
@@ -445,7 +445,7 @@ def test_a_report_without_rollouts_needs_files_alone(run: Path, tmp_path: Path, 
 def test_arguments_of_the_environment_go_with_the_policy(
     trained: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `evaluate` and `record` take from it, and what is given in place of that."""
+    """What `evaluate` and `record` take from it, and what replaces these values."""
     run = load_policy(trained[0])
     dataclasses.replace(run, info=run.info | {"env_kwargs": {"max_episode_steps": 7}}).save(tmp_path / "policy")
     made: list[dict[str, Any]] = []
@@ -490,7 +490,7 @@ def test_demos_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a dataset says of itself is shown as it is: brackets are no markup."""
+    """Text from a dataset is shown literally: brackets are not markup."""
     monkeypatch.setenv("COLUMNS", "300")
     row = {
         "task": "mine",

@@ -1,4 +1,4 @@
-"""The doctor says what is wrong and what to do, and fails only where training can't work."""
+"""The doctor says what is wrong and what to do, and fails only if training can't work."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_this_machine_can_train(capsys: pytest.CaptureFixture[str]) -> None:
 def test_only_what_training_needs_fails(
     needed: bool, code: int, mark: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What was raised and the remedy are shown as they are: brackets are no markup."""
+    """The exception and the remedy are shown literally: brackets are not markup."""
     checks = (("well", lambda: "found it", "-", True), ("ill", broken, "pip install '.[report]' in a clone", needed))
     monkeypatch.setattr(doctor, "CHECKS", checks)
     assert doctor.doctor() == code

@@ -1,4 +1,4 @@
-"""Laws of demonstrations: what is written is what is read, by us and by Minari, and what is damaged is refused."""
+"""Demonstrations are read as they were written, by us and by Minari, and damaged ones are refused."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def make_demos(*lengths: int, task: str = "walker_walk", info: dict | None = Non
 
 
 def refusal(call: Callable) -> str:
-    """The message of the `InputError` that `call` must raise; it must be one sentence."""
+    """The message of the `InputError` that `call` must raise, which must be one sentence."""
     with pytest.raises(InputError) as caught:
         call()
     message = str(caught.value)
@@ -155,7 +155,7 @@ def test_a_save_leaves_all_or_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_save_makes_sure_first_that_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twice the arrays, 64 KiB an episode and 1 MiB, by hand: 12 steps with 15 observations of 3 numbers and 2 of an action."""
+    """By hand: twice the arrays, 64 KiB per episode and 1 MiB, for 15 observations of 3 numbers and 12 actions of 2."""
     asked: list[int] = []
     monkeypatch.setattr(demos.files, "reserve", lambda folder, size: asked.append(size))
     make_demos(5, 3, 4).save(tmp_path / "mine")
@@ -175,7 +175,7 @@ def test_a_save_that_can_not_be_is_refused(tmp_path: Path) -> None:
     assert Demonstrations.load(make_demos().save(tmp_path / "empty")).num_steps == 12
 
 
-# --- What is damaged is refused ---
+# --- Damaged demonstrations are refused ---
 
 
 def edit_metadata(data: Path, **changes) -> None:
@@ -273,7 +273,7 @@ def test_rounding_in_actions_is_tolerated(tmp_path: Path) -> None:
 
 
 def test_a_dataset_can_not_name_code_to_be_run(tmp_path: Path) -> None:
-    """Where spaces are missing, Minari makes the environment of the file's `env_spec`: any function, any arguments."""
+    """Without spaces, Minari makes the environment of the file's `env_spec`, which may name any function and arguments."""
     folder = make_demos().save(tmp_path / "mine")
     harm = gymnasium.envs.registration.EnvSpec("Harm-v0", entry_point="os:mkdir", kwargs={"path": f"{tmp_path}/harm"})
     edit_metadata(folder / "data", env_spec=harm.to_json(), action_space=None)
@@ -293,7 +293,7 @@ def test_validate_compares_with_the_environment() -> None:
 
 
 def test_arrays_that_are_no_rows_of_numbers_are_refused() -> None:
-    """Whoever makes an `Episode` has its types checked in these tests alone."""
+    """The types of an `Episode` are checked at run time only in these tests."""
     for name, shape in (("obs", (6,)), ("obs", (6, 0)), ("action", (5,)), ("action", (5, 0))):
         episode = make_episode()
         object.__setattr__(episode, name, np.zeros(shape, np.float32))
@@ -329,11 +329,11 @@ def test_clipping_leaves_what_is_within_the_bounds_and_brings_the_rest_to_them()
     np.testing.assert_array_equal(given.clip().action[:, 0], [-1, -1, -0.5, 0.25, 1, 1, -1, -0.5, -0.25, 0.125, 0.5, 0.75])
 
 
-# --- Datasets of others ---
+# --- Datasets from other programs ---
 
 
 def write_foreign(folder: Path, observation_space, action_space, observations, actions: np.ndarray, **options) -> Path:
-    """One episode through Minari's own interface."""
+    """Write one episode through Minari's own interface."""
     folder.mkdir()
     storage = MinariStorage.new(folder / "data", observation_space, action_space, **options)
     steps = len(actions)
@@ -425,7 +425,7 @@ def test_only_hdf5_is_read(tmp_path: Path) -> None:
 
 @pytest.fixture
 def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package that ships `walker_walk`, and a user's Minari root with `mine/run-v1`; downloads are an error."""
+    """A package that includes `walker_walk`, and a user's Minari root with `mine/run-v1`; downloads raise an error."""
 
     def download(*_arguments, **_keywords) -> None:
         raise AssertionError("a download was attempted")
@@ -512,7 +512,7 @@ def test_arrays_become_episodes_and_what_is_absent_is_known(tmp_path: Path) -> N
     wider = np.zeros((4, 3))
     assert "Episode 1 of the arrays has obs" in refusal(lambda: Demonstrations.from_arrays([obs, wider]))
     assert "have no actions" in refusal(lambda: bare.action) and "have no rewards" in refusal(lambda: bare.returns)
-    assert Demonstrations.from_arrays([obs], [4 * action]).action.max() == 2, "what is out of bounds is for `clip`"
+    assert Demonstrations.from_arrays([obs], [4 * action]).action.max() == 2, "actions out of bounds are left to `clip`"
     assert Demonstrations.from_arrays([obs], rewards=[reward]).has_rewards
 
 
@@ -536,7 +536,7 @@ def test_importing_demos_does_not_import_minari() -> None:
 
 
 class TinyEnv(gymnasium.Env):
-    """A random start that drifts with the action for four steps; the observation is always the same buffer."""
+    """A random initial state that is moved by the action for four steps; every observation is the same array."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)

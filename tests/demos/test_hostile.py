@@ -1,4 +1,4 @@
-"""Nothing that is read can hurt: no file's code is run, and no file crashes, hangs, floods or leads to other files."""
+"""Reading hostile files is safe: none runs code, crashes, hangs, fills the memory or leads to other files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def policy(folder: Path, task: str, **info: Any) -> Path:
-    """A policy of the point mass's sizes that says it is of `task`."""
+    """A policy with the sizes of the point mass that claims to be for `task`."""
     spec = envs.spec(envs.make(POINT_MASS))
     Policy(Actor.init(spec.obs_dim, spec.action_dim, 4, 4, key=jax.random.key(0)), task, info).save(folder)
     return folder
@@ -57,7 +57,7 @@ def policy(folder: Path, task: str, **info: Any) -> Path:
 
 @pytest.fixture
 def evil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The present folder, in which importing `evil_code` or `evil_pack.inner` leaves a file RAN."""
+    """The current folder, in which importing `evil_code` or `evil_pack.inner` creates a file RAN."""
     monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", os.getcwd())])
     (tmp_path / "evil_pack").mkdir()
     for name in ("evil_code.py", "evil_pack/inner.py"):
@@ -162,7 +162,7 @@ def test_names_of_modules_are_told_from_other_text(task: str, arguments: Any, fo
 
 
 SHADOWS = ["tyro", "json", "typing", "numpy", "jax", "gymnasium", "h5py", "minari", "rich", "safetensors", "equinox", "csv"]
-"""Not contextlib and the like, which Python itself needs before `python -m pcil` begins."""
+"""Modules to shadow; not contextlib and others that Python itself needs before `python -m pcil` begins."""
 SCRIPT = "import sys; sys.path.pop(0); from pcil.cli import main; sys.exit(main())"
 
 
@@ -187,12 +187,12 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def dataset(sound: Path, tmp_path: Path) -> Path:
-    """A copy that may be damaged."""
+    """A copy that a test may damage."""
     return Path(shutil.copytree(sound, tmp_path / "demos"))
 
 
 def replaced(name: str, make: Callable[[h5py.Group, np.ndarray], Any]) -> Callable[[Path], None]:
-    """A damage: an array of the first episode is made anew from what it was."""
+    """A kind of damage: an array of the first episode is replaced by a function of it."""
 
     def change(folder: Path) -> None:
         with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
@@ -241,7 +241,7 @@ def shaped(name: str, shape: tuple[int, ...] | None = None, dtype: Any = None, *
 
 
 def consistent_bomb(folder: Path) -> None:
-    """All arrays agree with each other and with the metadata, and none of them holds anything."""
+    """All arrays agree with each other and with the metadata, but contain no data."""
     path, rows = folder / "data" / "metadata.json", 2**26
     metadata = json.loads(path.read_text())
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
@@ -259,7 +259,7 @@ def with_types(name: str, dtype: Any) -> Callable[[Path], None]:
 
 
 def deflated_chunk(folder: Path) -> None:
-    """A chunk that unfolds to gigabytes, whatever the array's shape says."""
+    """A chunk that decompresses to gigabytes, regardless of the array's shape."""
     with h5py.File(folder / "data" / "main_data.hdf5", "r+") as file:
         old = file["episode_0/actions"]
         shape = old.shape
@@ -269,7 +269,7 @@ def deflated_chunk(folder: Path) -> None:
 
 
 def index_of_itself(folder: Path) -> None:
-    """The index of the root group leads back to itself."""
+    """The index of the root group points to itself."""
     path = folder / "data" / "main_data.hdf5"
     data = bytearray(path.read_bytes())
     at = data.index(b"TREE")
@@ -470,7 +470,7 @@ ARRAYS: dict[str, dict[str, np.ndarray]] = {
 def test_arrays_of_a_policy_that_do_not_fit_each_other_are_refused(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as it is for users
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as for users
     rewritten(policy(tmp_path / "policy", POINT_MASS), ARRAYS[name])
     with pytest.raises(InputError, match=r"The policy in .* is damaged \(ValueError"):
         load_policy(tmp_path / "policy")
@@ -485,7 +485,7 @@ def test_a_policy_for_another_environment_is_one_sentence(tmp_path: Path, capsys
 
 
 def test_a_policy_whose_actions_are_no_numbers_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its numbers are finite; what comes of them is not."""
+    """Its numbers are finite, but the resulting actions are not."""
     folder = policy(tmp_path / "policy", POINT_MASS)
     loud = {
         name: np.full_like(array, 3e38) for name, array in load_file(folder / "policy.safetensors").items() if "head" in name

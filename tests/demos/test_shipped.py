@@ -1,4 +1,4 @@
-"""What ships in the package is what it says: plain Minari reads it, the recorded actions replay, the policies still act so."""
+"""Included data: plain Minari reads the demonstrations, their actions replay, and the policies reach their returns."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_one_episode_replays_from_its_seed(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_policy_still_reaches_the_tables_return(task: str) -> None:
-    """Two episodes, kept by the same rule, each within four standard deviations (or 5% of the mean) of the demonstrations'."""
+    """Two episodes selected by the same rule, each within four standard deviations (or 5%) of the demonstrations' mean."""
     shipped = demos.Demonstrations.load(task)
     rule, policy = shipped.info["record_minimum_return"], load_policy(POLICIES / task)
     rule = None if rule is None else float(rule)
@@ -60,7 +60,7 @@ def test_the_policy_still_reaches_the_tables_return(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_no_shipped_episode_is_a_failed_one(task: str) -> None:
-    """By the rule of experiments/experts.toml, and none has less than half of the task's mean."""
+    """All satisfy the rule of experiments/experts.toml, and none has less than half of the task's mean."""
     rule = {"minimum_return": 100} | tomllib.loads((ROOT / "experiments" / "experts.toml").read_text())[task]
     shipped = demos.Demonstrations.load(task)
     assert shipped.returns.min() >= max(rule["minimum_return"], shipped.returns.mean() / 2)

@@ -1,4 +1,4 @@
-"""What environments may return, and what is said of all else: one sentence with the environment, the value and the place."""
+"""Values that environments may return, and the one-sentence errors for others, which name environment, value and place."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def all_are_closed() -> Iterator[None]:
 
 @pytest.fixture
 def task() -> Iterator[Any]:
-    """Registers an odd environment under an id, without or with Gymnasium's time limit."""
+    """Registers an odd environment under an id, with or without Gymnasium's time limit."""
 
     def register(limit: int | None = 10, **wrong: Any) -> str:
         gymnasium.register("pcil_test/odd-v0", Odd, max_episode_steps=limit, kwargs=wrong)
@@ -39,7 +39,7 @@ def task() -> Iterator[Any]:
 
 
 def third_step(task: str) -> tuple[Any, ...]:
-    """What the third step returns."""
+    """The result of the third step."""
     with envs.opened(task) as env:
         env.reset(seed=7)
         return [env.step(ACTION) for _ in range(3)][-1]
@@ -69,7 +69,7 @@ def test_ends_are_taken_where_they_are_one_bool(flag: Any, name: str, task: Any)
 
 
 class Strange:
-    """No number, and no list of any."""
+    """A value that is neither a number nor a list of numbers."""
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ STEPS = [((np.zeros(2), 0.0, False, {}), "4"), ((np.zeros(2), 0.0), "2"), (None,
 @pytest.mark.parametrize("limit", [None, 10])
 @pytest.mark.parametrize(("step", "said"), STEPS)
 def test_a_step_returns_five_things(step: Any, said: str, limit: int | None, task: Any) -> None:
-    """With a time limit a wrapper of Gymnasium's unpacks them first; the first of `STEPS` is what Gym's steps returned."""
+    """With a time limit, a Gymnasium wrapper unpacks them first; the first of `STEPS` is the result of a step in old Gym."""
     with pytest.raises(InputError, match=said) as error:
         third_step(task(limit, step=step))
     expected = ["'pcil_test/odd-v0'", "(observation, reward, terminated, truncated, info)", "in step 3 of episode 1 (seed 7)"]
@@ -129,7 +129,7 @@ def test_an_absent_info_is_no_matter(task: Any) -> None:
 
 
 class Seedless(Odd):
-    """Its reset takes no seed, as before Gym 0.26."""
+    """An environment whose reset takes no seed, as before Gym 0.26."""
 
     def reset(self) -> Any:  # type: ignore
         return np.zeros(2)
@@ -166,7 +166,7 @@ def test_what_is_not_finite_is_told_with_its_place(wrong: dict[str, Any], said: 
 
 
 def test_large_finite_values_are_taken(task: Any) -> None:
-    """Whose squares are infinite in float32."""
+    """Even if their squares are infinite in float32."""
     obs, reward, *_ = third_step(task(obs=np.array([3e38, -3e38]), reward=3e38))
     assert obs.tolist() == np.array([3e38, -3e38], np.float32).tolist() and reward == 3e38
     gymnasium.registry.pop("pcil_test/odd-v0")
@@ -275,7 +275,7 @@ def test_a_close_that_raises_is_only_told(task: Any) -> None:
     ],
 )
 def test_actions_are_checked_too(action: Any, said: str, task: Any) -> None:
-    """Of a controller that is recorded, and of a policy that is evaluated."""
+    """Those of a recorded controller, and those of an evaluated policy."""
     with envs.opened(task()) as env:
         with pytest.raises(InputError, match=said):
             demos.record(lambda obs: action, env, 1, task="odd", seed=0, info={})

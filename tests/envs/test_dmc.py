@@ -1,4 +1,4 @@
-"""Our DeepMind Control against dm_control itself: every number of every step, bit for bit."""
+"""Our DeepMind Control environments compared with dm_control itself: every number of every step, bit for bit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Outcome(NamedTuple):
 
 
 class Reference:
-    """A fresh dm_control environment, its actions scaled to [-1, 1] where the task's bounds are others."""
+    """A new dm_control environment, with actions scaled to [-1, 1] if the task has other bounds."""
 
     def __init__(self, task: str, seed: int) -> None:
         env = suite.load(*split_name(task, suite.ALL_TASKS), task_kwargs={"random": seed})
@@ -61,7 +61,7 @@ def flat(observation: dict) -> np.ndarray:
 
 
 def actions_for(env: DMCEnv, steps: int, seed: int) -> np.ndarray:
-    """Uniform actions with stretches at the bounds and of rest."""
+    """Uniform actions with stretches at the bounds and at 0."""
     rng = np.random.default_rng(seed)
     actions = rng.uniform(-1.0, 1.0, (steps, *env.action_space.shape)).astype(np.float32)
     actions[steps // 5 : 2 * steps // 5] = np.sign(actions[steps // 5 : 2 * steps // 5])
@@ -70,7 +70,7 @@ def actions_for(env: DMCEnv, steps: int, seed: int) -> np.ndarray:
 
 
 def assert_same_episode(env: DMCEnv, task: str, seed: int, steps: int) -> tuple[int, Outcome]:
-    """Runs both for `steps` or to the end; returns how many steps there were and dm_control's last outcome."""
+    """Run both for `steps` steps or to the end; returns the number of steps and dm_control's last result."""
     reference = Reference(task, seed)
     obs, info = env.reset(seed=seed)
     np.testing.assert_array_equal(obs, reference.reset())
@@ -94,7 +94,7 @@ def test_two_whole_episodes_are_dm_controls(task: str) -> None:
     env = make(task)
     for seed in (7, 8):
         steps, end = assert_same_episode(env, task, seed, 500)
-        assert steps == 500 and end.last and end.discount == 1.0  # a time limit, no termination
+        assert steps == 500 and end.last and end.discount == 1.0  # a time limit, not a termination
 
 
 @pytest.mark.parametrize("task", OTHER_TASKS)
@@ -106,7 +106,7 @@ def test_any_task_of_the_suite_is_dm_controls(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_views_agree_in_states_that_are_rewarded(task: str) -> None:
-    """A random policy never sees most of some rewards, so states near and far from the initial pose are set directly."""
+    """A random policy never reaches most values of some rewards, so states near and far from the start are set directly."""
     env = make(task).unwrapped
     env.reset(seed=0)
     dm_task, physics = env._env.task, env.physics
@@ -129,10 +129,10 @@ def test_views_agree_in_states_that_are_rewarded(task: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("domain", "name"), [names for names in suite.ALL_TASKS if names[1] != "lqr_6_2"])
 def test_every_task_of_the_suite_is_dm_controls(domain: str, name: str) -> None:
-    """All but lqr_6_2, which diverges under random actions, whose bounds there are +-1e10."""
+    """All except lqr_6_2, whose action bounds are +-1e10, so that random actions make it diverge."""
     try:
         env = make(f"{domain}_{name}")
-    except InputError as error:  # quadruped_escape cannot do without OpenGL
+    except InputError as error:  # quadruped_escape needs OpenGL
         pytest.skip(str(error))
     for seed in (7, 8):
         assert_same_episode(env, f"{domain}_{name}", seed, 50)
@@ -143,7 +143,7 @@ def test_a_task_that_ends_with_discount_zero_terminates_at_once() -> None:
     env.reset(seed=3)
     reference.reset()
     for physics in (env.unwrapped.physics, reference.physics):
-        physics.set_state(np.zeros(4))  # closer to the goal than its tolerance
+        physics.set_state(np.zeros(4))  # within the goal's tolerance
         physics.forward()
     expected = reference.step(np.zeros(1))
     obs, reward, terminated, truncated, info = env.step(np.zeros(1))
@@ -176,7 +176,7 @@ def test_an_episode_is_a_function_of_its_seed() -> None:
     np.testing.assert_array_equal(episode(first, 3), original)
     np.testing.assert_array_equal(episode(second, 3), original)
     assert not np.array_equal(other, original)
-    unseeded = episode(second, None)  # follows from the last seed
+    unseeded = episode(second, None)  # determined by the previous seed
     episode(first, 3)
     np.testing.assert_array_equal(episode(first, None), unseeded)
     assert not np.array_equal(unseeded, original)
@@ -234,7 +234,7 @@ def test_a_diverged_simulation_raises_dm_controls_error() -> None:
     with pytest.raises(PhysicsError) as raised:
         env.step(np.zeros(6))
     assert str(raised.value) == str(expected.value)
-    assert_same_episode(env, "walker_walk", seed=1, steps=5)  # and leaves nothing behind
+    assert_same_episode(env, "walker_walk", seed=1, steps=5)  # the error has no later effect
 
 
 def test_physics_is_reachable() -> None:
@@ -250,7 +250,7 @@ def test_gymnasiums_own_checks_pass(task: str) -> None:
 
 
 def test_loading_says_nothing_and_mutes_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    """dm_control's own call warns of cheetah's model file, so there is something not to say."""
+    """dm_control itself warns about cheetah's model file, so there is a warning to suppress."""
     logger = logging.getLogger("absl")
     level = logger.level
     with caplog.at_level(logging.WARNING, "absl"):
@@ -270,7 +270,7 @@ def test_names_that_are_none() -> None:
 
 
 def test_no_opengl_is_needed_and_none_is_kept_away() -> None:
-    """In a fresh process without display or MUJOCO_GL; importing pcil.envs must not import dm_control either."""
+    """In a new process without display or MUJOCO_GL; importing pcil.envs must not import dm_control either."""
     program = (
         "import os, sys, pcil.envs\n"
         "assert 'dm_control' not in sys.modules and 'mujoco' not in sys.modules\n"
@@ -283,7 +283,7 @@ def test_no_opengl_is_needed_and_none_is_kept_away() -> None:
 
 
 def test_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """dm_control was imported without OpenGL long ago; an environment that draws still can, or says what is missing."""
+    """dm_control was imported earlier without OpenGL; an environment can still render, or says what is missing."""
     monkeypatch.setenv("MUJOCO_GL", "nothing")
     with pytest.raises(InputError, match=r"install EGL .* MUJOCO_GL=egl, or OSMesa"):
         make("walker_walk", render_mode="rgb_array")

@@ -1,4 +1,4 @@
-"""Every way to name an environment, and what is said about the names and spaces that do not work."""
+"""All ways to name an environment, and the errors for names and spaces that do not work."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SPECS = {
 
 
 class DictEnv(gymnasium.Env):
-    """Two boxes in a dictionary, a matrix among them, and actions with bounds of their own."""
+    """A dictionary of two boxes, one of them a matrix, and actions with other bounds."""
 
     def __init__(self, action_space: spaces.Space | None = None, observation_space: spaces.Space | None = None) -> None:
         low, high = np.array([0.0, -2.0]), np.array([1.0, 4.0])
@@ -62,7 +62,7 @@ class DictEnv(gymnasium.Env):
 
 @pytest.fixture
 def register_env() -> Iterator[Any]:
-    """Registers environments as `pcil_test/...` for the length of a test."""
+    """Registers environments as `pcil_test/...` for the duration of a test."""
     yield lambda name, entry_point, **kwargs: gymnasium.register(f"pcil_test/{name}", entry_point, kwargs=kwargs)
     for env_id in [env_id for env_id in gymnasium.registry if env_id.startswith("pcil_test/")]:
         del gymnasium.registry[env_id]
@@ -76,7 +76,7 @@ def test_public_names() -> None:
 def test_the_ten_have_their_sizes_and_no_wrapper(task: str) -> None:
     env = make(task)
     assert spec(env) == SPECS[task]
-    assert type(env) is envs.Checked and env.env is env.unwrapped, "nothing but the checks is around it"
+    assert type(env) is envs.Checked and env.env is env.unwrapped, "only the checks wrap it"
     assert env.spec.id == f"dmc/{task}-v0"
     assert env.observation_space.dtype == env.action_space.dtype == np.float32
     assert np.all(env.action_space.low == -1.0) and np.all(env.action_space.high == 1.0)
@@ -115,11 +115,11 @@ def test_a_real_gymnasium_env_works() -> None:
     assert spec(env) == Spec(3, 1, 1)
     env.reset(seed=0)
     obs, _, _, truncated, _ = [env.step(env.action_space.sample()) for _ in range(200)][-1]
-    assert obs.dtype == np.float32 and truncated  # its own time limit stays
+    assert obs.dtype == np.float32 and truncated  # its own time limit is kept
 
 
 def test_an_episode_without_an_end_is_refused(register_env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where Gymnasium knows no time limit; each episode is counted anew."""
+    """If Gymnasium knows no time limit; the count starts again with each episode."""
     monkeypatch.setattr(envs, "LONGEST_EPISODE", 5)
     register_env("Dict-v0", DictEnv)
     env, action = make("pcil_test/Dict-v0"), np.zeros(2, np.float32)
@@ -201,7 +201,7 @@ def test_timing_has_bare_physics_only_for_deepmind_control() -> None:
 
 @pytest.fixture
 def without_dmc(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a Python for which dm-control can't be installed."""
+    """As with a Python version for which dm-control can't be installed."""
     for name in [name for name in sys.modules if name.partition(".")[0] == "dm_control"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "dm_control", None)
@@ -231,7 +231,7 @@ def test_without_deepmind_control_its_tasks_say_what_is_missing(
 
 @pytest.mark.usefixtures("without_dmc")
 def test_without_deepmind_control_all_else_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What ships is listed, other environments are made, and a run says which versions it had."""
+    """Included demonstrations are listed, other environments are made, and a run records its versions."""
     assert cli.main(["demos", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == len(TASKS)
     assert spec(make("toy/point_mass-v0")) and spec(make("Pendulum-v1")) == Spec(3, 1, 1)
@@ -251,7 +251,7 @@ def test_without_deepmind_control_all_else_works(tmp_path: Path, capsys: pytest.
 
 def test_an_environment_of_the_package_says_how_many_frames_its_steps_take() -> None:
     class Repeating(PointMass):
-        """A suite's environment with an action repeat."""
+        """An environment with an action repeat."""
 
         action_repeat = 3
 

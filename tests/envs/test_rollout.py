@@ -1,4 +1,4 @@
-"""Episodes that are played side by side are those that are played one after the other."""
+"""Episodes played side by side equal those played one after the other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pcil.types import Episode
 
 
 class Walk(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A random walk of `length` steps; its noise comes from the seed of the reset."""
+    """A random walk of `length` steps; its noise depends on the seed of the reset."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -1,4 +1,4 @@
-"""The toys keep their promises: the values and the optimal actions that agents are tested against are right."""
+"""The toy environments have the values and optimal actions against which agents are tested."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_point_mass_is_solved_by_its_optimal_action_alone(seed: int) -> None:
     best, steps, terminated = point_mass_return("best", seed)
     assert steps == 50 and not terminated
     assert best > point_mass_return("near", seed)[0] > point_mass_return("random", seed)[0]
-    assert best > 50 - 10 * np.sqrt(2.0)  # at most 10 steps until it is home, where each step pays 1
+    assert best > 50 - 10 * np.sqrt(2.0)  # at most 10 steps to the goal, where the reward of each step is 1
 
 
 def test_point_mass_by_hand() -> None:
@@ -67,11 +67,11 @@ def test_point_mass_by_hand() -> None:
     assert reward == pytest.approx(1.0 - np.hypot(*moved), abs=1e-6)
     for _ in range(30):
         obs, *_ = env.step(np.ones(2))
-    np.testing.assert_array_equal(obs, [1.0, 1.0])  # the walls hold
+    np.testing.assert_array_equal(obs, [1.0, 1.0])  # the walls stop it
 
 
 def rollout(env: Probe, seed: int) -> tuple[list[float], list[float]]:
-    """Observations and rewards of one episode under the best actions."""
+    """The observations and rewards of one episode with the best actions."""
     obs, _ = env.reset(seed=seed)
     seen, rewards, terminated = [], [], False
     while not terminated:

@@ -1,4 +1,4 @@
-"""Laws of the mathematics: hand-computed numbers, naive second implementations in float64, and derivatives."""
+"""The losses: hand-computed numbers, naive second implementations in float64, and derivatives."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ interpolate = jax.jit(losses.interpolate)
 binary_cross_entropy = jax.jit(losses.binary_cross_entropy)
 n_step_target = jax.jit(losses.n_step_target, static_argnums=3)
 SHAPES = ((1, 1, 2), (4, 3, 5), (3, 8, 2))
-"""Batch, negatives, dimensions: few, as each is compiled."""
+"""Batch, negatives, dimensions; only a few, because each is compiled."""
 
 
 def unit_rows(rng: np.random.Generator, rows: int, dim: int) -> np.ndarray:
@@ -35,7 +35,7 @@ def unit_rows(rng: np.random.Generator, rows: int, dim: int) -> np.ndarray:
 
 @st.composite
 def embeddings(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Anchors, positives and negatives on the unit sphere, in float64; rows may repeat one another."""
+    """Anchors, positives and negatives on the unit sphere, in float64; rows may be equal."""
     batch, negatives, dim = draw(st.sampled_from(SHAPES))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     pool = unit_rows(rng, 1 + draw(st.integers(0, 20)), dim)
@@ -43,7 +43,7 @@ def embeddings(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def circle(*cosines: float) -> Float[Array, "rows 2"]:
-    """Unit vectors in the plane whose cosine with (1, 0) is given."""
+    """Unit vectors in the plane with given cosines with (1, 0)."""
     return jnp.array([[c, math.sqrt(1 - c * c)] for c in cosines])
 
 
@@ -51,7 +51,7 @@ def circle(*cosines: float) -> Float[Array, "rows 2"]:
 
 
 def naive_info_nce(anchor: np.ndarray, positive: np.ndarray, negatives: np.ndarray, temperature: float) -> float:
-    """Eq. 1 with its sign corrected, as it is written: for each anchor, one exponential after the other."""
+    """Eq. 1 with its sign corrected, written out: for each anchor, one exponential after the other."""
     losses = []
     for a, p in zip(anchor, positive, strict=True):
         numerator = math.exp(sum(x * y for x, y in zip(a, p, strict=True)) / temperature)
@@ -91,7 +91,7 @@ def test_info_nce_of_two_anchors_by_hand() -> None:
 
 
 def test_accuracy_is_the_share_of_anchors_whose_positive_beats_every_negative() -> None:
-    """The first alone does: the second's ties with a negative, the third's and the fourth's are behind one."""
+    """Only the first positive does: the second ties with a negative, and the third and fourth are farther than one."""
     positive = jnp.array([0.5, 0.2, 0.9, -0.5])
     negative = jnp.array([[0.4, -1.0], [0.2, 0.0], [0.8, 0.95], [-0.6, 0.3]])
     assert float(losses.contrast(positive, negative, 1.0)[1]["accuracy"]) == 0.25
@@ -135,7 +135,7 @@ def test_info_nce_falls_as_the_positive_and_rises_as_a_negative_comes_nearer() -
 def test_a_step_against_the_gradient_draws_the_positive_in_and_pushes_every_negative_away(
     seed: int, temperature: float
 ) -> None:
-    """The sign that the paper's Eq. 1 has wrong."""
+    """This sign is wrong in the paper's Eq. 1."""
     rng = np.random.default_rng(seed)
     with jax.enable_x64(True):
         anchor, positive, negatives = (jnp.asarray(unit_rows(rng, rows, 4)) for rows in (1, 1, 6))
@@ -165,7 +165,7 @@ def test_info_nce_has_the_derivative_that_differences_show() -> None:
 
 
 def naive_group_info_nce(rows: np.ndarray, group: np.ndarray, others: np.ndarray, temperature: float) -> float:
-    """Anchor by anchor, positive by positive, each with the negatives that it alone stands against."""
+    """For each anchor and each positive, the loss with the negatives of that anchor."""
     of_anchors = []
     for i, anchor in enumerate(rows):
         negatives = np.concatenate([rows[group != group[i]], others])
@@ -327,7 +327,7 @@ def test_cross_entropy_is_exact_at_logits_of_ten_thousand(expert: float, agent: 
 
 def test_the_expert_has_label_1() -> None:
     expert, agent = jax.grad(binary_cross_entropy, (0, 1))(jnp.array([0.3, -2.0]), jnp.array([0.3, -2.0]))
-    assert np.all(np.asarray(expert) < 0)  # a step against the gradient raises the expert's logits
+    assert np.all(np.asarray(expert) < 0)  # a gradient descent step raises the expert's logits
     assert np.all(np.asarray(agent) > 0)
 
 
@@ -343,7 +343,7 @@ def test_cross_entropy_has_the_derivative_that_differences_show() -> None:
 
 
 def naive_n_step_target(reward: list[float], discount: list[float], bootstrap: float, gamma: float) -> float:
-    """Forwards in time: what each step is worth, until the episode terminates."""
+    """Forwards in time: the discounted reward of each step, until the episode terminates."""
     total, worth = 0.0, 1.0
     for r, alive in zip(reward, discount, strict=True):
         total += worth * r
@@ -361,7 +361,7 @@ def test_one_step_is_the_reward_and_the_discounted_value() -> None:
     [((1, 1, 1), 1 + 2 / 2 + 4 / 4 + 16 / 8), ((1, 1, 0), 1 + 2 / 2 + 4 / 4), ((1, 0, 0), 1 + 2 / 2), ((0, 0, 0), 1)],
 )
 def test_three_steps_by_hand_with_a_termination_at_each(discount: tuple[int, ...], target: float) -> None:
-    """Rewards 1, 2, 4, a value of 16 behind them and a discount of 1/2."""
+    """Rewards 1, 2, 4, a bootstrap value of 16 and a discount of 1/2."""
     result = n_step_target(jnp.array([[1.0, 2.0, 4.0]]), jnp.array([discount], jnp.float32), jnp.array([16.0]), 0.5)
     assert float(result[0]) == target
 

@@ -1,4 +1,4 @@
-"""Laws of the networks and of exploration: one forward pass in two libraries, orthogonal starts, exact clamps."""
+"""The networks and exploration: one forward pass in two libraries, orthogonal initialisation, exact clamps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ OBS_DIM, ACTION_DIM, FEATURES, HIDDEN = 5, 3, 8, 16
 
 
 def randomised(network: eqx.Module, seed: int = 0) -> eqx.Module:
-    """The same network with every number random, so that no bias is 0 and no scale is 1."""
+    """The same network with random numbers everywhere, so that no bias is 0 and no scale is 1."""
     rng = np.random.default_rng(seed)
     draw = lambda leaf: jnp.asarray(rng.normal(size=leaf.shape, scale=0.7), leaf.dtype)  # noqa: E731
     return jax.tree.map(draw, network)
@@ -96,7 +96,7 @@ def test_the_actor_is_the_float64_formula() -> None:
 
 
 def naive_trunk(trunk: Trunk, obs: np.ndarray) -> np.ndarray:
-    """Row by row in float64: linear, subtract the mean, divide by the deviation, scale, offset, tanh."""
+    """Row by row in float64: linear, subtract the mean, divide by the standard deviation, scale, offset, tanh."""
     rows = []
     for row in obs.astype(np.float64):
         x = row @ np.asarray(trunk.weight, np.float64) + np.asarray(trunk.bias, np.float64)
@@ -117,7 +117,7 @@ def test_a_row_does_not_depend_on_the_batch_around_it() -> None:
     np.testing.assert_allclose(together, alone, rtol=0, atol=1e-6)
 
 
-# --- How they start ---
+# --- Initialisation ---
 
 
 @pytest.mark.parametrize("make", [make_actor, make_critic, small_mlp])
@@ -141,7 +141,7 @@ def test_no_two_layers_and_no_two_keys_start_alike() -> None:
 
 
 def test_the_networks_have_the_sizes_of_drq_v2() -> None:
-    """Linear to the features; two hidden layers; the critic's heads see features and action."""
+    """A linear layer to the features, then two hidden layers; the inputs of the critic's heads are features and action."""
     actor, critic = make_actor(), make_critic()
     assert actor.trunk.weight.shape == critic.trunk.weight.shape == (OBS_DIM, FEATURES)
     assert [w.shape for w in actor.head.weights] == [(FEATURES, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, ACTION_DIM)]
@@ -296,7 +296,7 @@ def test_the_first_step_of_adam_is_the_learning_rate_against_the_gradient() -> N
 @law
 @given(st.integers(0, 2**32), st.integers(1, 30))
 def test_the_scalers_statistics_are_those_of_all_rows_seen(seed: int, batches: int) -> None:
-    """As long as fewer batches were seen than the least rate allows, against NumPy over the rows together."""
+    """Until the smallest rate is reached, compared with NumPy over all rows together."""
     rng = np.random.default_rng(seed)
     rows = (rng.normal(size=(batches, 8, 3)) * [1, 10, 0.1] + [0, -20, 5]).astype(np.float32)
     scaler = Scaler.init(3)
@@ -360,7 +360,7 @@ def test_the_floor_of_the_deviation_is_a_share_of_the_mean_and_the_bound_is_ten_
 
 
 def test_an_entry_that_stays_where_it_is_for_long_is_not_blown_up() -> None:
-    """Rounding stops its mean short of it, and the variance at what is missing."""
+    """By rounding, its mean stops short of the value, and its variance stops at the squared difference."""
     scaler = Scaler(jnp.array([0.3]), jnp.array([1.0]), jnp.float32(1e6))
     rows = np.full((8, 1), 0.7, np.float32)
     scaler = jax.lax.fori_loop(0, 100_000, lambda _, s: s.update(jnp.asarray(rows)), scaler)

@@ -1,4 +1,4 @@
-"""Sinkhorn's plan by its marginals, by a naive logarithmic one, by exact transport, and from compiled code again and again."""
+"""Sinkhorn's plan: its marginals, a naive plan in the log domain, exact transport, and repeated calls from compiled code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pcil.rewards import POTIL
 
 
 def random_cost(rows: int, columns: int, seed: int) -> np.ndarray:
-    """One minus the cosines of random vectors, as the rewards have it."""
+    """One minus the cosines of random vectors, as in the rewards."""
     rng = np.random.default_rng(seed)
     x, y = rng.standard_normal((rows, 3)), rng.standard_normal((columns, 3)) + 0.5
     x, y = (z / np.linalg.norm(z, axis=1, keepdims=True) for z in (x, y))
@@ -33,7 +33,7 @@ def plan_of(cost: np.ndarray, epsilon: float, iterations: int, weight: np.ndarra
 
 
 def naive_plan(cost: np.ndarray, epsilon: float, rounds: int) -> np.ndarray:
-    """By the potentials' logarithms: columns are made right first, then rows, from potentials of 0 on."""
+    """In the log domain, starting with potentials of 0: each iteration corrects the columns, then the rows."""
     rows, columns = cost.shape
     kernel = -cost.astype(np.float64) / epsilon
     log_u, log_v = np.zeros(rows), np.zeros(columns)
@@ -46,7 +46,7 @@ def naive_plan(cost: np.ndarray, epsilon: float, rounds: int) -> np.ndarray:
 @settings(deadline=None, derandomize=True, max_examples=15)
 @given(rows=st.integers(1, 9), columns=st.integers(1, 9), rounds=st.integers(1, 40), seed=st.integers(0, 99))
 def test_plan_equals_a_naive_logarithmic_one(rows: int, columns: int, rounds: int, seed: int) -> None:
-    """Round by round. A round that leaves no error ends the work, and further rounds would change nothing."""
+    """For each number of iterations. The algorithm stops when no error is left; more iterations would change nothing."""
     cost = random_cost(rows, columns, seed)
     assert np.allclose(plan_of(cost, 0.05, rounds), naive_plan(cost, 0.05, rounds), atol=1e-6)
 
@@ -81,7 +81,7 @@ def test_cost_falls_to_that_of_the_exact_plan_as_epsilon_shrinks() -> None:
 
 
 def test_padding_gets_no_mass_and_changes_nothing() -> None:
-    """Of rows and of columns, also where the cost there is no number."""
+    """For padded rows and columns, even if the cost there is NaN."""
     cost = random_cost(12, 10, 4)
     padded = np.pad(cost, ((0, 2), (0, 3)), constant_values=np.nan)
     x_weight, y_weight = (jnp.asarray([1 / n] * n + [0.0] * spare, jnp.float32) for n, spare in ((12, 2), (10, 3)))
@@ -110,7 +110,7 @@ def test_no_gradient_flows_through_the_plan() -> None:
 
 
 def test_compiled_code_calls_back_again_and_again_without_waiting_for_itself() -> None:
-    """Large costs on the one thread of the tests, behind a condition, all dispatched before the first is done."""
+    """Large costs on the single thread of the tests, inside a condition, all dispatched before the first is finished."""
     cost, weight = jnp.asarray(random_cost(500, 500, 6)), jnp.full(500, 1 / 500)
 
     @jax.jit

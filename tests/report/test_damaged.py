@@ -1,4 +1,4 @@
-"""One damaged run, whatever is in its files: a note in the page and on the terminal, and the others' report as ever."""
+"""A damaged run, whatever its files contain, gives a note on the page and the terminal; the others are reported as usual."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from pcil import cli
 from pcil.report import load, page, tables
 
 OTHERS: list[Any] = [None, True, "x", "", "3", -1, 1.5, 10**60, -(10**299), math.nan, math.inf, 1e300, [], [1], {}, {"a": 1}]
-"""Values of other kinds than the one that should be there."""
+"""Values of unexpected types."""
 
 
 def told(folder: Path, *names: str, value: Any) -> None:
-    """Another value at this place of a `run.json`."""
+    """Replaces a value in `run.json`."""
     about = table = json.loads((folder / "run.json").read_text())
     for name in names[:-1]:
         table = table[name]
@@ -32,7 +32,7 @@ def told(folder: Path, *names: str, value: Any) -> None:
 
 
 def without(name: str) -> Callable[[Path], None]:
-    """Takes a column of `eval.csv` away."""
+    """Removes a column of `eval.csv`."""
 
     def damage(folder: Path) -> None:
         with (folder / "eval.csv").open() as file:
@@ -55,12 +55,12 @@ def row(text: str, name: str = "eval.csv") -> Callable[[Path], None]:
 
 
 def instead(content: bytes, name: str = "eval.csv") -> Callable[[Path], Any]:
-    """Another file under this name."""
+    """Replaces the file."""
     return lambda folder: (folder / name).write_bytes(content)
 
 
 def pipe(name: str) -> Callable[[Path], None]:
-    """A pipe that nobody writes to, under this name."""
+    """Replaces the file by a pipe to which nothing is written."""
 
     def damage(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
@@ -121,7 +121,7 @@ HOSTILE = [
     "=1+1</style></title><script>alert(1)</script><img src=x onerror=alert(1)>",
     "$\\frac{$ \" onerror=alert(1) x=\"' onmouseover='x {{7*7}} {% raw %} a|b`c*d[e](f) &lt; 行",
 ]
-"""Names that are taken, shown as they are, and do nothing."""
+"""Names that are accepted, shown literally, and have no effect."""
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_a_damaged_run_is_a_note_and_the_others_stay(damage: str, runs: Path, tm
 
 
 def test_the_page_and_the_terminal_say_what_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
-    """All of them at once, and a file of results that is none."""
+    """All damaged runs at once, and an invalid file of results."""
     good = fake_run(Path("runs") / "good", [0.0, 1.0, 2.0], method="dac")
     for i, damage in enumerate(DAMAGES.values()):
         damage(fake_run(Path("runs") / f"bad-{i}", [0.0, 1.0], correlation=[0.5]))
@@ -163,7 +163,7 @@ def test_half_a_line_takes_its_evaluation_with_it(tmp_path: Path) -> None:
     for lost in range(1, last + half):
         (run / "eval.csv").write_text(text[:-lost])
         found = load.collect([run])
-        if lost == half:  # a whole line is missing, which nobody can see
+        if lost == half:  # a complete line is missing, which can't be noticed
             assert len(found.rows) == 3 and found.notes == []
         else:
             assert [row.return_mean for row in found.rows] == [1.0, 2.0]
@@ -171,7 +171,7 @@ def test_half_a_line_takes_its_evaluation_with_it(tmp_path: Path) -> None:
 
 
 def test_settings_of_every_kind_are_shown(tmp_path: Path) -> None:
-    """Deep, long and odd values of settings that a report only shows."""
+    """Nested, long and odd values of settings that a report only shows."""
     value = ["\ud800", "$x", "<b>", "x" * 9000, [[[1.5]]], None, {"a": "\x1b[31m"}]
     fake_run(tmp_path / "a", [1.0], odd=value)
     fake_run(tmp_path / "b", [1.0], odd=value[::-1])
@@ -183,7 +183,7 @@ def test_settings_of_every_kind_are_shown(tmp_path: Path) -> None:
 
 
 class Page(HTMLParser):
-    """Tags and attributes of a page, and its words."""
+    """The tags, attributes and text of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -199,7 +199,7 @@ class Page(HTMLParser):
 
 
 def test_names_are_shown_as_they_are_and_do_nothing(tmp_path: Path) -> None:
-    """As task, method, preset, setting, commit and folder: the page has the elements that it has of plain names."""
+    """As task, method, preset, setting, commit and folder: the page has the same elements as with plain names."""
     transitions = tmp_path / "transitions.csv"
     for side, names in (("plain", ["plain"] * len(HOSTILE)), ("odd", HOSTILE)):
         for i, name in enumerate(names):

@@ -30,7 +30,7 @@ frames,episode,return,length,seconds
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """As much of a run folder as a figure needs."""
+    """The parts of a run folder that a figure needs."""
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "eval.csv").write_text(EVALUATIONS)
@@ -42,7 +42,7 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Axes]]:
-    """The axes of every figure that is closed, kept for a look."""
+    """The axes of every closed figure, kept for inspection."""
     kept: list[Axes] = []
     with monkeypatch.context() as patch:
         patch.setattr(plt, "close", lambda figure: kept.extend(figure.axes))
@@ -59,7 +59,7 @@ def curve(
 
 
 def lines(axes: Axes) -> dict[str, list[float]]:
-    """Heights of the labelled lines, by label."""
+    """The y values of the labelled lines, by label."""
     return {str(line.get_label()): list(line.get_ydata()) for line in axes.lines if not str(line.get_label()).startswith("_")}
 
 
@@ -74,7 +74,7 @@ def test_a_runs_curve_is_a_picture_in_its_folder(run: Path) -> None:
     assert path == run / "curve.png"
     height, width, _ = image.shape
     assert width >= 1000 and 500 <= height < width
-    assert image.reshape(-1, 3).std(axis=0).min() > 0.03, "blank paper has no variance"
+    assert image.reshape(-1, 3).std(axis=0).min() > 0.03, "a blank picture has no variance"
     red = (image[..., 0] > 0.6) & (image[..., 1] < 0.1)
     assert red.any(axis=0).sum() > width / 2, "the mean's line in the method's colour crosses the picture"
     assert not plt.get_fignums(), "figures are closed, or a long sweep would fill the memory"
@@ -96,7 +96,7 @@ def test_a_run_without_an_expert_has_no_such_line(run: Path, drawn: list[Axes]) 
 
 
 def test_axes_begin_at_zero_except_where_returns_are_below(run: Path, drawn: list[Axes]) -> None:
-    """Pendulum-v1 never returns more than 0."""
+    """The return of Pendulum-v1 is never above 0."""
     figures.run_curve(run, 160.0)
     (run / "eval.csv").write_text("frames,episode,return,length,seconds\n0,0,-900.0,200,0.1\n1000,0,-300.0,200,0.1\n")
     figures.run_curve(run, -150.0)
@@ -117,7 +117,7 @@ def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:
 
 
 def test_a_long_legend_takes_nothing_from_the_panels(tmp_path: Path, drawn: list[Axes]) -> None:
-    """Twenty variants in one column, on paper that grows with them."""
+    """Twenty variants in one column; the figure grows with them."""
     few, many = (
         [row for i in range(count) for row in curve("task", "pcil", 1, 1, 2, variant=f"default, some.setting_of_a_run={i}")]
         for count in (2, 20)
@@ -129,7 +129,7 @@ def test_a_long_legend_takes_nothing_from_the_panels(tmp_path: Path, drawn: list
 
 
 def test_a_grid_shows_means_over_seeds_as_far_as_all_have_come(tmp_path: Path, drawn: list[Axes]) -> None:
-    """Student's interval of two numbers is +- 12.706 half distances; the band is drawn although the axis may cut it."""
+    """Student's interval of two numbers is +- 12.706 times half their distance; the axis may cut off the band."""
     figures.grid(curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6), tmp_path / "grid")
     (axes,) = drawn
     assert lines(axes) == {"pcil": [2, 4], "demos": [9, 9]} and axes.get_title() == "task, 2 seeds"
@@ -167,7 +167,7 @@ def test_health_is_drawn_where_it_is_known(tmp_path: Path, drawn: list[Axes]) ->
 
 
 def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) -> None:
-    """Four seeds with 0.5, 0.7, 0.3 and 1 of their experts at the end: without the lowest and the highest, 0.6."""
+    """Four seeds end at 0.5, 0.7, 0.3 and 1 times the expert's return: without the lowest and the highest, the mean is 0.6."""
     rows = curve("a", "pcil", 1, 0, 5, expert=10.0) + curve("a", "pcil", 2, 0, 7, expert=10.0)
     rows += curve("b", "pcil", 1, 0, 6, expert=20.0) + curve("b", "pcil", 2, 0, 20, expert=20.0)
     rows += curve("c", "dac", 1, 3, 4, expert=None)
@@ -178,7 +178,7 @@ def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) 
 
 
 def test_a_method_without_steps_is_a_level_line(tmp_path: Path, drawn: list[Axes]) -> None:
-    """At the mean of its seeds' last returns; together with other tasks at its share."""
+    """At the mean of its seeds' last returns; for several tasks, at the fraction of the expert's return."""
     rows = curve("a", "bc", 1, 0, 1, 4) + curve("a", "bc", 2, 0, 1, 6)
     rows += curve("a", "pcil", 1, 0, 9) + curve("b", "pcil", 1, 0, 9)
     figures.grid(rows, tmp_path / "grid", columns=2)
@@ -193,7 +193,7 @@ def test_without_an_expert_there_is_nothing_to_put_together(tmp_path: Path) -> N
 
 
 def test_the_same_grid_is_the_same_file(tmp_path: Path) -> None:
-    """Committed figures change only where their numbers do."""
+    """Committed figures change only if their numbers do."""
     rows = curve("task", "pcil", 1, 1, 2, 3) + curve("task", "pcil", 2, 3, 6)
     one, two = (figures.grid(rows, tmp_path / name / "grid") for name in "ab")
     assert one == two
@@ -202,7 +202,7 @@ def test_the_same_grid_is_the_same_file(tmp_path: Path) -> None:
         assert first == second and b"CreationDate" not in first
 
 
-# --- Looks ---
+# --- Appearance ---
 
 
 def luminance(colour: str) -> float:
@@ -221,7 +221,7 @@ def test_every_method_has_a_look_and_can_be_told_without_colour() -> None:
 
 @pytest.mark.parametrize("colour", [look.colour for look in (*figures.STYLES.values(), *figures.SPARE_STYLES)])
 def test_lines_stand_out_from_the_paper(colour: str) -> None:
-    assert 1.05 / (luminance(colour) + 0.05) > 3, "WCAG's least contrast of graphical objects"
+    assert 1.05 / (luminance(colour) + 0.05) > 3, "WCAG's minimum contrast for graphical objects"
 
 
 def test_a_look_does_not_depend_on_who_else_is_there() -> None:
@@ -235,7 +235,7 @@ def test_a_look_does_not_depend_on_who_else_is_there() -> None:
 
 
 def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes]) -> None:
-    """A row a method, a column a task; one panel is missing; of two seeds the first is drawn."""
+    """One row for each method, one column for each task; one panel is missing; of two seeds the first is drawn."""
 
     def make_transitions(task: str, method: str, seed: int, shift: float) -> list[TransitionRow]:
         head = (task, method, "default", seed, 5000)
@@ -255,7 +255,7 @@ def test_transitions_are_drawn_where_they_lie(tmp_path: Path, drawn: list[Axes])
     assert np.asarray(agent.get_offsets()).tolist() == [[11, 1], [12, 3]]
     assert expert.get_xydata().tolist() == [[10, 0]] and expert.get_label() == "expert"
     assert agent.get_array().tolist() == [0, 2]
-    assert [axes.collections[0].get_clim() for axes in panels] == [(0, 5), (0, 5), (0, 2)], "a task has one scale of colours"
+    assert [axes.collections[0].get_clim() for axes in panels] == [(0, 5), (0, 5), (0, 2)], "a task has one colour scale"
     red, green, blue = to_rgb(expert.get_color())
     assert blue > green > red, "experts are blue"
     low, high = figures.REWARD_COLOURS([0.0, 1.0])

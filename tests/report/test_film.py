@@ -1,4 +1,4 @@
-"""A film shows the policy's own episode, picture by picture; where there is nothing to be seen, that is said."""
+"""A film shows an episode of the policy, picture by picture; if nothing can be shown, a message says so."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pcil.report.load import collect
 
 
 class Clock(gymnasium.Env):
-    """Ends after ten steps; a picture is as bright as steps have been made."""
+    """Ends after ten steps; the brightness of a picture is the number of steps."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012  as gymnasium.Env declares it
     observation_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
@@ -57,7 +57,7 @@ def with_policy(folder: Path, task: str) -> Path:
 
 
 def test_a_film_has_a_picture_for_every_so_many_steps(tmp_path: Path, clock: str) -> None:
-    """Steps 0, 4 and 8 of the ten; 4 steps at 20 a second are 200 ms."""
+    """Steps 0, 4 and 8 of the ten; 4 steps at 20 steps per second are 200 ms."""
     animation = Image.open(io.BytesIO(film.film(with_policy(tmp_path / "run", clock))))
     assert (animation.format, animation.size, animation.n_frames, animation.info["loop"]) == ("WEBP", (32, 24), 3, 0)
     shades = []

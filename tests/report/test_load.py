@@ -1,4 +1,4 @@
-"""Run folders to rows and back; what is a run, which runs are seeds of one variant, and what is left out in words."""
+"""Run folders to rows and back; what counts as a run, which runs are seeds of one variant, and messages about omitted ones."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def make_run(folder: Path) -> Path:
 
 
 def test_each_evaluation_is_one_row(tmp_path: Path) -> None:
-    """The correlation is that of the episodes since the evaluation before which have one: null is none, and so is the 0 of
-    older logs. Half a line of a killed run is no episode."""
+    """The correlation is the mean of the episodes since the previous evaluation that have one: null means none, as does 0 in
+    older logs. An incomplete line of a killed run does not count."""
     rows = read_run(make_run(tmp_path / "run"))
     assert rows == [
         EvalRow("walker_walk", "pcil", "default", 3, 0, 2.5, 1.0, 4.0, 947.456, "abc+", 0.1, None),
@@ -39,7 +39,7 @@ def test_each_evaluation_is_one_row(tmp_path: Path) -> None:
 
 
 def test_a_run_without_episodes_has_no_correlation(tmp_path: Path) -> None:
-    """Behavioural cloning plays none while it trains."""
+    """Behavioural cloning plays no episodes while it trains."""
     folder = make_run(tmp_path / "run")
     (folder / "train.jsonl").write_text('{"frames": 1000, "agent/loss": 1.0}\n')
     assert {row.correlation for row in read_run(folder)} == {None}
@@ -113,22 +113,22 @@ def test_a_csv_gives_the_same_rows_as_its_runs(tmp_path: Path) -> None:
     write_rows(tmp_path / "all.csv", found.rows)
     again = collect([tmp_path / "all.csv"])
     assert again.rows == found.rows and again.sources == {}
-    assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).rows == found.rows, "no seed counts twice"
+    assert collect([tmp_path / "all.csv", tmp_path / "sweep"]).rows == found.rows, "each seed counts once"
 
 
 def test_a_run_in_two_files_is_whole_and_of_the_first(tmp_path: Path) -> None:
-    """Never the first frames of one and the last of the other."""
+    """A run is never put together from rows of two files."""
     short, long = tmp_path / "short.csv", tmp_path / "long.csv"
     for seed, path, returns in ((1, short, [1, 2]), (2, long, [3, 4, 5])):
         runs = [fake_run(tmp_path / f"a{seed}", returns), fake_run(tmp_path / f"b{seed}", [9], method="dac", seed=seed)]
         write_rows(path, collect(runs).rows)
     both = collect([short, long])
-    assert [row.return_mean for row in both.rows] == [1, 2, 9, 9], "DAC's two seeds are of one file each"
+    assert [row.return_mean for row in both.rows] == [1, 2, 9, 9], "each of DAC's two seeds comes from one file"
     assert both.notes == [f"{long} holds runs that {short} has too; those of the latter are shown."]
 
 
 def test_runs_that_differ_in_a_setting_are_no_seeds_of_each_other(tmp_path: Path) -> None:
-    """What differs on one task names the variant on every task, so that variants can be compared over tasks."""
+    """A setting that differs on one task is in the variant's name on every task, so that variants can be compared."""
     fake_run(tmp_path / "a", [1], seed=1, checkpoint_seconds=1)
     fake_run(tmp_path / "b", [2], seed=2, checkpoint_seconds=2)
     fake_run(tmp_path / "c", [3], seed=1, agent={"gamma": 0.9})
@@ -157,7 +157,7 @@ def test_where_no_value_is_the_usual_one_all_are_told(tmp_path: Path) -> None:
 def test_a_budget_that_differs_on_one_task_makes_two_rows_of_a_method(
     first: int, second: int, third: int, longer: str, tmp_path: Path
 ) -> None:
-    """The most frequent goes without a name, else the longest; a task of one budget is never parted from the others."""
+    """The most frequent number of frames is not named, else the largest; a task with only one number is not split."""
     fake_run(tmp_path / "a", [1], "hopper_hop", frames=first)
     fake_run(tmp_path / "b", [2], "hopper_hop", frames=second)
     fake_run(tmp_path / "c", [3], "walker_run", frames=third)

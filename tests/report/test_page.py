@@ -1,4 +1,4 @@
-"""The page of a report: whole, self-contained, the same for the same runs, and in a browser as it should be."""
+"""The page of a report: complete, self-contained, reproducible, and correct in a browser."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def film(shade: int = 0) -> bytes:
 
 
 def everything(folder: Path) -> Collection:
-    """Two tasks, two methods, three seeds, a method of one's own with a daring name, and transitions of all methods."""
+    """Two tasks, two methods, three seeds, a user's own method with an odd name, and transitions of all methods."""
     fake_sweep(folder)
     fake_run(folder / "own", [1.0, 2.0], "my_module:MyTask-v0", "<b>my.module:Mine</b>", expert=None, done=False)
     found = load.collect([folder])
@@ -51,7 +51,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Where everything of a page comes from, what can be seen, and which elements stay open."""
+    """The sources of all parts of a page, its visible text, and the elements that are not closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -79,11 +79,11 @@ class Page(HTMLParser):
 
 
 def test_the_page_needs_nothing_but_itself(report: Path) -> None:
-    """Images lie in it, links lead into it or to its tables; no script, no address, and 5 MB are not reached."""
+    """Images are embedded, and links lead into the page or to its tables; no script, no address, and less than 5 MB."""
     text = report.read_text()
     seen = Page(text)
     assert seen.open == [] and "script" not in seen.tags
-    assert len(seen.sources) == 3 + 1 + 1 + 3 + 1, "curves of three tasks, one of all, health, t-SNE of three tasks, a film"
+    assert len(seen.sources) == 3 + 1 + 1 + 3 + 1, "curves of three tasks and of all, health, t-SNE of three tasks, a film"
     assert all(source.startswith("data:image/") for source in seen.sources)
     for target in seen.targets:
         inside = target == "data:," or (target.startswith("#") and target[1:] in seen.ids)
@@ -104,7 +104,7 @@ def test_its_images_are_whole(report: Path) -> None:
 def test_it_says_what_was_found(report: Path) -> None:
     words = Page(report.read_text()).words
     assert "13 runs: " in words and "A run is left out & said so." in words
-    assert "<b>my.module:Mine</b>" in words, "a name is shown as it is written"
+    assert "<b>my.module:Mine</b>" in words, "a name is shown literally"
     for title in ("Final return of each task", "Comparison with the paper", "Sample efficiency", "Health of the learned"):
         assert title in words
     assert "200.0 [-48.4,\u00a0448.4]" in words and "agent.gamma: 0.99" in words and "commit: 0123456789abcdef" in words
@@ -123,7 +123,7 @@ def test_figures_and_tables_lie_beside_it(report: Path) -> None:
 
 
 def test_its_rows_alone_make_the_same_report(report: Path, tmp_path: Path) -> None:
-    """All but settings, film and notes come back from the two files of rows, byte for byte."""
+    """Everything except settings, film and notes is reproduced from the two files of rows, byte for byte."""
     rows = [report.parent / "tables" / name for name in ("evaluations.csv", "transitions.csv")]
     page.build(load.collect(rows), tmp_path, {})
     for path in (*report.parent.glob("tables/*"), *report.parent.glob("figures/*")):
@@ -136,7 +136,7 @@ def test_its_rows_alone_make_the_same_report(report: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 900), (390, 844)], ids=["desktop", "phone"])
 def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
-    """No error in the console, no request, nothing wider than the window, each image loads; a click enlarges and closes."""
+    """No error in the console, no request, nothing wider than the window; images load, and a click enlarges or closes one."""
     assert shutil.which(CHROMIUM), "this test needs a browser: apt-get install chromium"
     from playwright.sync_api import sync_playwright
 
@@ -157,7 +157,7 @@ def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
         assert len(images) == 9 and all(done and width > 0 and shown > 0 for done, width, shown in images)
 
         def overflow() -> list[str]:
-            """Elements that reach beyond the window, except inside what scrolls by itself."""
+            """Elements that extend beyond the window, except inside elements with their own scroll bars."""
             right = "e.getBoundingClientRect().right > document.documentElement.clientWidth + 1"
             elements = "[...document.querySelectorAll('body *')]"
             return window.evaluate(
@@ -181,7 +181,7 @@ def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
 
 
 def test_a_report_replaces_a_report_and_nothing_else(tmp_path: Path) -> None:
-    """What an earlier one drew of other runs goes; a page that is not ours stays, and so does a file of somebody else's."""
+    """Figures of an earlier report are removed; a page that is not ours is kept, and so are other files."""
     out = tmp_path / "out"
     for task in ("walker_run", "hopper_hop"):
         fake_run(tmp_path / task, [1.0, 2.0], task)

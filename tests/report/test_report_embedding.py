@@ -1,4 +1,4 @@
-"""Rows of a representation: distances, silhouettes and places against naive computations and what must hold for them."""
+"""Rows of a representation: distances, silhouettes and positions compared with naive computations and known properties."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REWARD = RNG.random(20)
 
 
 def naive_silhouette(i: int, rows: np.ndarray, mine: np.ndarray) -> float:
-    """Rousseeuw 1987: how much nearer the own cluster is than the other."""
+    """Rousseeuw 1987: how much nearer a row's own cluster is than the other one."""
     distance = [float(np.linalg.norm(rows[i] - row)) for row in rows]
     own = np.mean([d for k, d in enumerate(distance) if mine[k] == mine[i] and k != i])
     other = np.mean([d for k, d in enumerate(distance) if mine[k] != mine[i]])
@@ -46,7 +46,7 @@ def test_distances_and_silhouettes_are_the_naive_ones() -> None:
 
 
 def test_what_is_apart_is_drawn_apart() -> None:
-    """The nearest neighbour in the picture is one's own kind; and the same rows give the same picture."""
+    """The nearest neighbour of a point is in the same cluster, and the same rows give the same picture."""
     transitions = project(EXPERT, AGENT + 50, REWARD, RUN)
     places = np.array([(row.x, row.y) for row in transitions])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + np.diag(np.full(32, np.inf))
@@ -66,7 +66,7 @@ def transitions_of(
 @law
 @given(st.lists(st.integers(0, 100).map(float), min_size=3, max_size=20, unique=True))
 def test_distance_that_tells_all_has_rank_correlation_minus_one(distances: list[float]) -> None:
-    """However reward falls with distance, as long as it falls; the agent's silhouettes do not count."""
+    """For every decreasing function of the distance; the agent's silhouettes do not count."""
     assert measures(transitions_of(distances, [math.exp(-d / 50) for d in distances])) == pytest.approx((-1, 0.375))
     assert measures(transitions_of(distances, [d**3 for d in distances]))[0] == pytest.approx(1)
 

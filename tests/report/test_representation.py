@@ -1,4 +1,4 @@
-"""Representations of trained runs: the right layer of the right networks on the right transitions; folders stay untouched."""
+"""Representations of trained runs: the right layer of the right networks on the right transitions; folders are unchanged."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def test_rows_are_added_for_every_run_that_has_a_representation(trained: Path, found: Collection) -> None:
-    """128 transitions of the expert and 50 of the agent, whose episodes have no more; the task's reward learns nothing."""
+    """128 transitions of the expert and all 50 of the agent's episode; the task's reward learns no representation."""
     before = files(trained)
     representation.add(found)
     assert files(trained) == before and found.notes == []
@@ -94,7 +94,7 @@ def test_rows_are_added_for_every_run_that_has_a_representation(trained: Path, f
 def test_the_transitions_are_those_of_the_newest_networks(
     trained: Path, found: Collection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The distances follow from the finished run's own state; nothing learns while the episode is played."""
+    """The distances follow from the state of the finished run; nothing is trained while the episode is played."""
     kept: dict[str, Any] = {}
     plain = representation.play
 
@@ -145,7 +145,7 @@ def test_a_run_of_before_a_setting_was_there_is_made_again(trained: Path) -> Non
     ],
 )
 def test_what_is_not_ours_is_never_made(change: dict[str, Any], trained: Path, tmp_path: Path) -> None:
-    """A description from elsewhere runs no code: only classes of the registries are made, with settings that they have."""
+    """A foreign description runs no code: only classes of the registries are made, with settings that they have."""
     folder = Path(shutil.copytree(trained / "pcil", tmp_path / "pcil"))
     about = json.loads((folder / "run.json").read_text())
     for name, value in change.items():
@@ -178,7 +178,7 @@ def test_a_run_without_its_networks_is_left_out_and_said(damage: str, trained: P
 
 
 def test_no_step_is_drawn_twice_and_each_keeps_its_reward() -> None:
-    """Two episodes of 4 and 3 steps; states, actions and rewards carry their own number."""
+    """Two episodes of 4 and 3 steps; states, actions and rewards are numbered."""
 
     def numbered(first: int, steps: int) -> Episode:
         numbers = np.arange(first, first + steps, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Statistics against published numbers, second implementations, exact enumeration, and their laws."""
+"""Statistics compared with published numbers, second implementations and exact enumeration, and their properties."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ tasks = st.lists(scores, min_size=1, max_size=3)
 
 
 def naive_iqm(values: list[float]) -> float:
-    """Sort, leave out the lowest and the highest quarter (rounded down), and average the rest."""
+    """Sort, remove the lowest and the highest quarter (rounded down), and average the rest."""
     cut = len(values) // 4
     kept = sorted(values)[cut : len(values) - cut]
     return sum(kept) / len(kept)
@@ -124,13 +124,13 @@ def test_the_bootstrap_draws_seeds_within_their_task() -> None:
 
 
 def test_the_bootstrap_is_that_of_all_possible_draws() -> None:
-    """Every one of the 3^3 x 2^2 equally likely draws is made by hand."""
+    """Compared with an enumeration of all 3^3 x 2^2 equally likely draws."""
     strata = [np.array([1.0, 4.0, 10.0]), np.array([20.0, 50.0])]
     draws = itertools.product(itertools.product(strata[0], repeat=3), itertools.product(strata[1], repeat=2))
     exact = np.array([naive_iqm([*a, *b]) for a, b in draws])
     value, low, high = stats.iqm_interval(strata)
     assert value == pytest.approx(naive_iqm([1, 4, 10, 20, 50]))
-    for end, level in ((low, 0.025), (high, 0.975)):  # up to what 2000 random draws of the 108 leave open
+    for end, level in ((low, 0.025), (high, 0.975)):  # up to the error of 2000 random draws of the 108
         assert np.mean(exact < end - 1e-9) - 0.01 < level < np.mean(exact <= end + 1e-9) + 0.01
     assert stats.iqm_interval(strata) == stats.iqm_interval(strata), "the same numbers give the same interval"
 

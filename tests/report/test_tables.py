@@ -1,4 +1,4 @@
-"""The tables of runs whose numbers are known, worked out by hand; and how they are written."""
+"""The tables of runs with known numbers, computed by hand, and their formatting."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rows(text: str) -> list[str]:
 
 
 def test_finals(sweep: Collection) -> None:
-    """Half of Student's interval of three numbers 100 apart is 248.4; of 27 bootstrap draws 1 is all lowest, 1 all highest."""
+    """Student's interval of three numbers 100 apart is +- 248.4; of 27 bootstrap draws, 1 is all lowest, 1 all highest."""
     text = tables.markdown(tables.finals(sweep))
     assert text.startswith("| task | method | variant | mean | sd | IQM | expert | of expert | seeds | frames |\n| --- | --- |")
     assert rows(text) == [
@@ -73,7 +73,7 @@ def test_beside_the_paper_where_the_intervals_are_apart(tmp_path: Path) -> None:
 
 
 def test_the_papers_table_is_copied_without_a_slip() -> None:
-    """The differences of its rows and columns, summed on paper."""
+    """Differences between its rows and columns, summed on paper."""
     means = {method: [mean for mean, _ in row] for method, row in tables.PAPER.items()}
     assert {method: round(sum(row), 1) for method, row in means.items()} == {
         "pcil": 2557.0,
@@ -86,7 +86,7 @@ def test_the_papers_table_is_copied_without_a_slip() -> None:
 
 
 def test_all_tasks_together(sweep: Collection) -> None:
-    """PCIL's shares are 0.25, 0.5, 0.75 and 0.7, 0.8, 0.9: mean 0.65; IQM without the lowest and the highest 0.6875."""
+    """PCIL's fractions are 0.25, 0.5, 0.75 and 0.7, 0.8, 0.9: mean 0.65; IQM, without the lowest and the highest, 0.6875."""
     table = tables.aggregate(sweep)
     assert [row[:2] + row[4:] for row in table.rows] == [("pcil", "default", 2, 6), ("dac", "default", 2, 6)]
     (mean, iqm), (half_mean, half_iqm) = (row[2:4] for row in table.rows)
@@ -96,7 +96,7 @@ def test_all_tasks_together(sweep: Collection) -> None:
 
 
 def test_sample_efficiency(tmp_path: Path) -> None:
-    """Expert 800, so 400, 640 and 720. Two of three seeds reach the half, the median of 1000, 2000 and never is 2000."""
+    """The levels are 400, 640 and 720 of 800. Two of three seeds reach 400; the median of 1000, 2000 and never is 2000."""
     for seed, returns in enumerate(([0.0, 400.0, 650.0, 730.0], [0.0, 0.0, 500.0, 500.0], [0.0, 0.0, 0.0, 0.0]), 1):
         fake_run(tmp_path / str(seed), returns, seed=seed)
     fake_run(tmp_path / "no expert", [0.0, 1.0], "hopper_hop", expert=None)
@@ -114,7 +114,7 @@ def test_probability_of_improvement(sweep: Collection) -> None:
 
 
 def test_methods_are_compared_at_the_frames_that_both_have(tmp_path: Path) -> None:
-    """PCIL ends at 9 after 3000 frames, and is behind at 1000, where DAC ends; BC's frames are no steps, so its end counts."""
+    """PCIL ends at 9 after 3000 frames, and is behind at 1000, where DAC ends; BC takes no steps, so its end is compared."""
     fake_run(tmp_path / "a", [0.0, 1.0, 5.0, 9.0], method="pcil")
     fake_run(tmp_path / "b", [0.0, 2.0], method="dac")
     fake_run(tmp_path / "c", [0.0, 8.0], method="bc")

@@ -91,7 +91,7 @@ def test_info_nce_of_two_anchors_by_hand() -> None:
 
 
 def test_accuracy_is_the_share_of_anchors_whose_positive_beats_every_negative() -> None:
-    """Only the first positive does: the second ties with a negative, and the third and fourth are farther than one."""
+    """Only the first positive does: the second ties with a negative, and the third and the fourth are beaten by one."""
     positive = jnp.array([0.5, 0.2, 0.9, -0.5])
     negative = jnp.array([[0.4, -1.0], [0.2, 0.0], [0.8, 0.95], [-0.6, 0.3]])
     assert float(losses.contrast(positive, negative, 1.0)[1]["accuracy"]) == 0.25

@@ -17,7 +17,7 @@ SETTINGS = narrow(DAC())
 
 
 def test_reward_is_the_logit_even_where_the_sigmoid_saturates() -> None:
-    """`log D - log(1 - D)` of a logit of 200 is 200; by logarithms in float32 it would be infinite."""
+    """`log D - log(1 - D)` of a logit of 200 is 200; computed with logarithms in float32 it would be infinite."""
     discriminator = MLP((jnp.ones((1, 1)), jnp.ones((1, 1))), (jnp.zeros(1), jnp.zeros(1)))
     state = DiscriminatorState(discriminator, None)
     obs = jnp.array([[0.0], [3.0], [200.0]])

@@ -1,4 +1,4 @@
-"""The seam of rewards, by a reward that pays the sum of what it is given: defaults, labels and slow features by hand."""
+"""The reward interface, tested with a reward that is the sum of its inputs: defaults, labels and slow features by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EMBED = Trunk.init(2, 3, key=KEY)
 
 @dataclass(frozen=True)
 class Sum(Reward):
-    """The state's number, ten times the first entry of the observation and a hundred times that of the action."""
+    """The sum of the state's number, ten times the observation's first entry and a hundred times the action's first entry."""
 
     inputs: Inputs = "state"
     begins_with: int = 0
@@ -45,7 +45,7 @@ class Sum(Reward):
 
 
 class Bare(Reward):
-    """Nothing but what the seam itself has."""
+    """A reward with only the defaults of the interface."""
 
     init = update = reward = None  # type: ignore[assignment]
 

@@ -1,4 +1,4 @@
-"""What every reward must do; the reward of every method in `presets.METHODS` is tested by being there."""
+"""Requirements for every reward; the rewards of all methods in `presets.METHODS` are tested automatically."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DEMOS = [staying(EXPERT.obs[i : i + 100], EXPERT.action[i : i + 100]) for i in (
 
 RUNS = [presets.make("walker_walk", method) for method in presets.METHODS]
 KINDS = {(type(run.reward), getattr(run.reward, "head", "")): run for run in RUNS}
-"""A run of each class of reward and, where it has heads, of each head."""
+"""A run of each class of reward and, if it has heads, of each head."""
 CASES = {run.method: narrow(run.reward, learning_rate=3e-3) for run in KINDS.values()}
 CASES |= {
     "pcil-stages": dataclasses.replace(CASES["pcil"], stages=3),
@@ -40,7 +40,7 @@ CASES |= {
 
 
 def rows(batch: Batch, start: int, size: int, span: int = 1) -> Batch:
-    """`size` windows of the batch from a start on; each ten of the batch are from another episode."""
+    """`size` windows of the batch, starting at `start`; every ten rows of the batch are from another episode."""
     every = batches(batch, span)
     every = every._replace(episode_id=jnp.arange(len(every.obs)) // 10)
     return Batch(*(array[start : start + size] for array in every))
@@ -62,7 +62,7 @@ def test_every_class_and_both_heads_are_tested() -> None:
 
 @pytest.fixture(scope="module")
 def trained(settings: Reward) -> Any:
-    """The state after 300 updates on an expert and an agent that live apart."""
+    """The state after 300 updates on an expert and an agent whose states are far apart."""
     update = jax.jit(lambda state, expert, agent, key: settings.update(state, expert, agent, embed, key=key)[0])
     state = settings.init(DEMOS, embed, key=jax.random.key(0))
     for i in range(300):
@@ -109,7 +109,7 @@ PAIRS = {f"{name} of pairs": dataclasses.replace(CASES[name], inputs="state-acti
 
 @pytest.mark.parametrize("case", [name for name in CASES | PAIRS if name not in ("pwil", "potil", "expert")])
 def test_an_update_learns_from_the_first_steps_of_longer_windows_alone(case: str) -> None:
-    """The agent's windows may have more steps than the reward asked for: those behind its span make no difference."""
+    """The agent's windows may have more steps than the reward needs: those after its span make no difference."""
     settings = (CASES | PAIRS)[case]
     state = settings.init(DEMOS, embed, key=jax.random.key(0))
     update = jax.jit(lambda *both: settings.update(state, *both, embed, key=jax.random.key(1)))
@@ -130,13 +130,13 @@ WITH_INPUTS = {
 
 @pytest.mark.parametrize("case", [*WITH_INPUTS, "tcn", "potil"])
 def test_init_update_and_reward_are_functions_of_the_same_inputs(case: str) -> None:
-    """Where the state before a step, its action or the state after it is another one, all three give another result if it is
-    among the inputs, and the same to the last bit if it is not."""
+    """If the state before a step, its action or the state after it changes, the results of all three change if it is one of
+    the inputs, and are the same bit for bit if it is not."""
     settings: Any = (CASES | WITH_INPUTS)[case]
     inputs = getattr(settings, "inputs", "state")
-    keeps = settings.scope == "episode" or case.startswith(("pcil of", "tcn"))  # demonstrations in its state from the first
+    keeps = settings.scope == "episode" or case.startswith(("pcil of", "tcn"))  # its state holds demonstrations from the start
     read = {"state": {"next_obs"}, "state-action": {"obs", "action"}, "transition": {"obs", "next_obs"}}[inputs]
-    learns = settings.batch_size > 0 and case != "tcn"  # which compares states of a window, whose obs and next_obs overlap
+    learns = settings.batch_size > 0 and case != "tcn"  # TCN compares states of a window, whose obs and next_obs overlap
     first, second, agent = (
         Batch(*(jnp.asarray(array + shift) for array in batch[:3])) for batch, shift in ((EXPERT, 0), (EXPERT, 0.5), (AGENT, 0))
     )
@@ -181,8 +181,8 @@ def test_expert_outranks_the_agent_after_a_few_updates(settings: Reward, trained
 
 
 def test_only_rewards_of_whole_episodes_depend_on_other_steps(settings: Reward, trained: Any) -> None:
-    """A step's reward does not depend on its neighbours, up to which random expert row it is compared with; that of a whole
-    episode changes with another step of it."""
+    """A step's reward does not depend on other steps, except through the random expert row it is compared with; with rewards
+    of whole episodes, it changes if another step does."""
     if settings.scope == "episode":
         fresh, changed = settings.init(DEMOS, embed, key=jax.random.key(0)), AGENT.obs.copy()
         changed[:50] = EXPERT.obs[:50]
@@ -196,7 +196,7 @@ def test_only_rewards_of_whole_episodes_depend_on_other_steps(settings: Reward, 
 
 
 def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trained: Any) -> None:
-    """Of a reward that says so, whatever the states are there; one that doesn't is never given any."""
+    """If a reward takes padding, for all padded states; other rewards are never given any."""
     steps, behind = np.s_[:70], np.full((30, 2), np.nan, np.float32)
     episode = staying(AGENT.obs[steps], AGENT.action[steps])
     padded = staying(AGENT.obs[:100], np.concatenate([episode.action, behind]))
@@ -211,7 +211,7 @@ def test_rows_behind_the_end_of_an_episode_change_nothing(settings: Reward, trai
 
 
 def test_a_task_reward_of_weight_0_leaves_no_trace(settings: Reward, trained: Any) -> None:
-    """Whatever it is: 0 times NaN would be NaN."""
+    """For any value of it: 0 times NaN would be NaN."""
     settings = dataclasses.replace(settings, task_weight=0.0)
     batch = Batch.of(jnp.asarray(AGENT.obs[:5][None]), jnp.asarray(AGENT.action[:4][None]))
     got = [label(settings, trained, batch, jnp.full((1, 4), true), embed, key=jax.random.key(9)) for true in (0.0, jnp.nan)]
@@ -233,7 +233,7 @@ def test_a_penalty_of_weight_0_leaves_no_trace(module: str, monkeypatch: pytest.
 
 
 def test_task_reward_is_added_with_its_weight(settings: Reward, trained: Any) -> None:
-    """One equation for all: learned + weight x true, in the shape of the true reward, read from the right state."""
+    """One equation for all rewards: learned + weight x true, in the shape of the true reward, for the right state."""
     settings = dataclasses.replace(settings, task_weight=0.7)
     rng = np.random.default_rng(0)
     obs, action = rng.standard_normal((3, 5, 4), dtype=np.float32), rng.uniform(-1, 1, (3, 4, 2)).astype(np.float32)

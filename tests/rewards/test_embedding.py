@@ -1,4 +1,4 @@
-"""The two heads on an embedding: hand-computed numbers, a naive second computation, and that the embedding never feels them."""
+"""The two heads on an embedding: hand-computed numbers, a naive second computation, and no effect on the embedding."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def update(settings: PCIL | TCN, state: EmbeddingState, expert: Batch, agent: Ba
 
 
 def test_similarity_by_hand() -> None:
-    """Two expert rows, three steps: "random" meets rows 0, 1, 0; "mean" meets their mean."""
+    """Two expert rows and three steps: "random" compares with rows 0, 1, 0; "mean" compares with their mean."""
     expert = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     steps = jnp.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.6, 0.8, 0.0]])
     assert np.allclose(similarity(steps, expert, "random"), [1.0, 0.0, 0.6])
@@ -43,7 +43,7 @@ def test_similarity_by_hand() -> None:
 def test_the_logit_is_the_reward_even_where_the_sigmoid_saturates() -> None:
     """Weights (300, 0) and bias -100 at the directions (1, 0), (-1, 0), (0.6, 0.8): 200, -400 and 80.
 
-    By logarithms in float32 the first would be infinite: `1 - D` is 0 there.
+    With logarithms in float32 the first would be infinite, because `1 - D` is 0.
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
     classifier = Classifier(MLP((jnp.array([[300.0], [0.0]]),), (jnp.array([-100.0]),)), None)
@@ -55,7 +55,7 @@ def test_the_logit_is_the_reward_even_where_the_sigmoid_saturates() -> None:
 
 @pytest.mark.parametrize("settings", BOTH, ids=lambda s: type(s).__name__)
 def test_the_classifier_takes_a_step_of_cross_entropy_with_label_1_for_the_expert(settings: PCIL | TCN) -> None:
-    """By probabilities in float64: `dL/dlogit` is `D - 1` on the expert and `D` on the agent, each a mean over its rows.
+    """With probabilities in float64: `dL/dlogit` is `D - 1` on the expert and `D` on the agent, each averaged over its rows.
 
     Adam's first moment after one step is a tenth of the gradient.
     """
@@ -64,7 +64,7 @@ def test_the_classifier_takes_a_step_of_cross_entropy_with_label_1_for_the_exper
     after, metrics = update(settings, state, expert, agent, jax.random.key(1))
     first = [
         (w.next_obs if isinstance(settings, PCIL) else w.obs)[:, 0] for w in (expert, agent)
-    ]  # what the encoder learns from
+    ]  # the inputs of the encoder's update
     phi_e, phi_a = (np.asarray(unit_sphere(state.encoder(obs)), np.float64) for obs in first)
     weight, bias = np.asarray(state.classifier.linear.weights[0], np.float64)[:, 0], float(state.classifier.linear.biases[0][0])
     d_e, d_a = (1 / (1 + np.exp(-(phi @ weight + bias))) for phi in (phi_e, phi_a))
@@ -74,7 +74,7 @@ def test_the_classifier_takes_a_step_of_cross_entropy_with_label_1_for_the_exper
     assert np.allclose(mean.weights[0][:, 0], slope / 10, atol=1e-7)
     assert float(mean.biases[0][0]) == pytest.approx((np.mean(d_e - 1) + np.mean(d_a)) / 10, abs=1e-7)
     moved = np.asarray(after.classifier.linear.weights[0][:, 0]) - weight
-    assert np.allclose(moved, -settings.learning_rate * np.sign(slope), rtol=1e-2), "Adam's first step has the rate's length"
+    assert np.allclose(moved, -settings.learning_rate * np.sign(slope), rtol=1e-2), "Adam's first step has the rate's size"
 
 
 @pytest.mark.parametrize("settings", BOTH, ids=lambda s: type(s).__name__)
@@ -96,7 +96,7 @@ def test_the_embedding_never_feels_the_head(settings: PCIL | TCN) -> None:
 
 @pytest.mark.parametrize("preset", presets.PRESETS)
 def test_the_four_rows_of_table_1_differ_in_representation_and_head_alone(preset: str) -> None:
-    """Agent, schedule, labels and the reward's sizes and rates are the same for all four."""
+    """Agent, schedule, labels and the reward's sizes and learning rates are the same for all four."""
     runs = {method: presets.make("hopper_stand", method, preset) for method in ("pcil", "tcn", "pcil-gail", "tcn-gail")}
     assert len({dataclasses.replace(run, method="", reward=PCIL()) for run in runs.values()}) == 1
     for name, kind in (("pcil", PCIL), ("tcn", TCN)):
@@ -110,7 +110,7 @@ def test_the_four_rows_of_table_1_differ_in_representation_and_head_alone(preset
 
 @pytest.mark.parametrize("settings", BOTH, ids=lambda s: type(s).__name__)
 def test_the_classifier_starts_from_draws_of_its_own(settings: PCIL | TCN) -> None:
-    """Independent normals: the classifier's first weights are not the encoder's, up to a factor."""
+    """Independent normal draws: the classifier's initial weights are not proportional to the encoder's."""
     state = settings.init([random_batch(50, 6, 1)], itself, key=jax.random.key(0))
     head, first = (np.asarray(net.weights[0]).ravel() for net in (state.classifier.linear, state.encoder))
     assert abs(np.corrcoef(head, first[: len(head)])[0, 1]) < 0.999

@@ -1,4 +1,4 @@
-"""PCIL's reward against hand-computed numbers and a naive second implementation."""
+"""PCIL's reward compared with hand-computed numbers and a naive second implementation."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ loss = jax.jit(PCIL.loss, static_argnums=0)
 
 @functools.partial(jax.jit, static_argnums=0)
 def update(settings: PCIL, state: EmbeddingState, expert: Batch, agent: Batch, *, key: Any) -> tuple[EmbeddingState, Any]:
-    """One update where the features are the observations."""
+    """One update in which the features are the observations."""
     return settings.update(state, expert, agent, lambda obs: obs, key=key)
 
 
 @pytest.mark.parametrize("temperature", [0.07, 1.0])
 def test_loss_equals_a_naive_one(temperature: float) -> None:
-    """Loops over anchors and negatives in float64, with the very positives and mixtures that the key gives."""
+    """Loops over anchors and negatives in float64, with the same positives and mixtures that the key gives."""
     settings = dataclasses.replace(SETTINGS, temperature=temperature)
     expert, agent, partner, key = features(1), features(2), features(3), jax.random.key(4)
     total, metrics = settings.loss(ENCODER, expert, agent, partner, key=key)
@@ -94,7 +94,7 @@ def test_no_gradient_flows_into_the_partner() -> None:
 
 
 def test_gradients_against_finite_differences() -> None:
-    """The contrast alone, and the penalty with its partner as the constant that the loss makes of it."""
+    """The contrast alone, and the penalty with its partner held constant, as in the loss."""
     with jax.enable_x64(True):
         double = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)  # noqa: E731
         encoder, expert, agent, fixed = double((ENCODER, features(1, 8), features(2, 8), features(3, 8, dim=4)))
@@ -148,7 +148,7 @@ def test_reference_is_the_last_expert_batch() -> None:
 
 
 def test_the_penaltys_partner_is_the_batch_before_and_its_mixtures_are_of_expert_and_agent_rows() -> None:
-    """By one row's gradient at a time: the first update's partners are the random references, the second's its first batch.
+    """One row's gradient at a time: the partners of the first update are the random references, those of the second its batch.
 
     `u` is drawn with the second half of the update's key.
     """
@@ -185,7 +185,7 @@ def test_no_anchor_is_its_own_positive() -> None:
 
 
 def test_a_lazy_penalty_comes_at_every_so_many_updates_and_weighs_as_much_more() -> None:
-    """With `penalty_every = 3`: all, with three times the penalty, at updates 0, 3, ...; the contrast alone between."""
+    """With `penalty_every = 3`: the loss with three times the penalty at updates 0, 3, ...; only the contrast in between."""
     lazy, key = dataclasses.replace(SETTINGS, penalty_every=3), jax.random.key(4)
     parts = features(1), features(2), features(3)
     _, usual = loss(SETTINGS, ENCODER, *parts, key=key)
@@ -208,7 +208,7 @@ def test_updates_are_counted_by_the_state() -> None:
 
 
 def products(settings: PCIL) -> tuple[int, int]:
-    """Matrix products in the gradient of the loss: those always computed, and those inside a `cond`."""
+    """The numbers of matrix products in the gradient of the loss that are always computed, and that are inside a `cond`."""
     parts = features(1), features(2), features(3)
     slope = jax.grad(lambda e, count: settings.loss(e, *parts, key=jax.random.key(4), count=count)[0])
 
@@ -225,10 +225,10 @@ def products(settings: PCIL) -> tuple[int, int]:
 
 
 def test_between_its_turns_a_lazy_penalty_costs_no_matrix_product() -> None:
-    """The contrast alone has 4 layers and the cosines forwards; backwards, 2 for each but the first layer's input: 14."""
+    """The contrast alone has 4 layers and the cosines forwards, and 2 for each backwards except the first layer's input: 14."""
     always, sometimes = products(SETTINGS)
     lazy_always, lazy_sometimes = products(dataclasses.replace(SETTINGS, penalty_every=4))
-    assert sometimes == 0, "without laziness there is no branch"
+    assert sometimes == 0, "if the penalty is always computed there is no branch"
     assert lazy_always == 14 and lazy_sometimes == always - 14 > 0
 
 
@@ -236,7 +236,7 @@ def test_between_its_turns_a_lazy_penalty_costs_no_matrix_product() -> None:
 
 
 def test_stages_are_quantiles_of_the_batch_by_hand() -> None:
-    """Of episodes 5, 5, 9, 2, as many rows are from earlier ones as 1, 1, 3, 0."""
+    """For rows of episodes 5, 5, 9, 2, the numbers of rows from earlier episodes are 1, 1, 3, 0."""
     number = jnp.array([5, 5, 9, 2])
     assert stages(number, 1).tolist() == [0, 0, 0, 0]
     assert stages(number, 2).tolist() == [0, 0, 1, 0]
@@ -253,11 +253,11 @@ def test_stages_follow_the_order_of_episodes_and_part_none(number: np.ndarray, c
     assert all(len(set(stage[number == n])) == 1 for n in number)
     assert np.array_equal(stage, stages(jnp.asarray(3 * number + 7), count)), "only the order counts"
     if len(set(number)) == 12 and 12 % count == 0:
-        assert np.array_equal(np.bincount(stage), np.full(count, 12 // count)), "stages are of one size"
+        assert np.array_equal(np.bincount(stage), np.full(count, 12 // count)), "stages are of equal size"
 
 
 def test_anchors_on_stages_add_their_weighted_loss_and_leave_the_experts_alone() -> None:
-    """Naive loops over agent anchors: same stage draws, other stages and the expert push; the rest of the loss is as ever."""
+    """Naive loops over agent anchors: rows of the same stage attract, other stages and the expert repel; no other change."""
     settings, key = dataclasses.replace(SETTINGS, temperature=0.5, stages=3, stage_weight=0.25), jax.random.key(4)
     parts = features(1), features(2), features(3)
     number = np.random.default_rng(0).integers(0, 9, 32)
@@ -294,7 +294,7 @@ def test_stages_come_from_the_agents_episodes_and_only_where_they_are_asked_for(
 
 
 def test_training_gathers_each_stage_and_parts_it_from_the_others() -> None:
-    """Two stages of the agent that lie apart: each becomes a cluster, away from the other and from the expert."""
+    """Two separate stages of the agent: each becomes a cluster, away from the other and from the expert."""
     settings = dataclasses.replace(SETTINGS, stages=2, learning_rate=1e-2, penalty=0.0)
     demo, rows = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
     late = np.arange(33) % 2
@@ -314,9 +314,9 @@ def test_training_gathers_each_stage_and_parts_it_from_the_others() -> None:
 
 
 def test_with_a_task_weight_the_label_is_a_weighted_sum_by_hand() -> None:
-    """The relaxed setting of the paper's outlook. Features are the encoder's: a step to (3, 4) has cosine 0.6 with (1, 0).
+    """The setting of the paper's outlook. The features are the embedding: a step to (3, 4) has cosine 0.6 with (1, 0).
 
-    Paid 2 by the task with weight 0.5, it is labelled 0.6 + 1.
+    With a task reward of 2 and weight 0.5, its label is 0.6 + 1.
     """
     encoder = MLP((jnp.eye(2),), (jnp.zeros(2),))
     state = EmbeddingState(encoder, None, only("state", staying(jnp.array([[1.0, 0.0]]), jnp.zeros((1, 1)))), None)
@@ -328,7 +328,7 @@ def test_with_a_task_weight_the_label_is_a_weighted_sum_by_hand() -> None:
 
 
 def test_the_agent_is_trained_on_the_weighted_sum() -> None:
-    """Through the compiled step, whose target's mean rises by weight x reward, discounted over the window, and nothing else."""
+    """In the compiled step, the mean of the target increases by exactly weight x reward, discounted over the window."""
     run = small_run(reward={"task_weight": 0.5})
     spec, demos, n = Spec(2, 2, 1), random_batch(50, 2, 2), run.agent.n_step
     window, expert = windows(random_batch(32 + n, 2, 2, seed=1), n), windows(random_batch(33, 2, 2))
@@ -343,7 +343,7 @@ def test_the_agent_is_trained_on_the_weighted_sum() -> None:
 
 
 def test_actions_make_no_difference() -> None:
-    """The encoder is a function of the state (section 3.2), whatever Eq. 1 says of pairs."""
+    """The encoder is a function of the state (section 3.2), although Eq. 1 is written with pairs."""
     demo, seen = random_batch(33, 6, 1, 1), random_batch(33, 6, 1, 2)
     learned = []
     for factor in (1, -1):
@@ -357,7 +357,7 @@ def test_actions_make_no_difference() -> None:
 
 
 def test_nothing_flows_into_the_agents_features() -> None:
-    """Encoder updates stop at the features, as in the authors' agent/pcil.py: the loop's embed blocks the gradient."""
+    """The gradient of encoder updates stops at the features, as in the authors' agent/pcil.py: the loop's `embed` blocks it."""
     run = small_run()
     agent = run.agent.init(Spec(6, 1, 1), key=jax.random.key(0))
     batch = random_batch(32, 6, 1)

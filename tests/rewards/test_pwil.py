@@ -30,12 +30,12 @@ def column(*values: float) -> jax.Array:
 
 
 def grid(rows: int, seed: int) -> np.ndarray:
-    """Points with small whole coordinates: their distances are exact in float32, and many are equal."""
+    """Points with small integer coordinates: their distances are exact in float32, and many are equal."""
     return np.random.default_rng(seed).integers(-3, 4, (rows, 2)).astype(np.float32)
 
 
 def naive_costs(atoms: np.ndarray, points: np.ndarray, horizon: int) -> list[float]:
-    """The cost of each step, written as the paper's Algorithm 1 with exact fractions; used atoms leave the list."""
+    """The cost of each step by the paper's Algorithm 1 with exact fractions; used atoms are removed from the list."""
     held: list[list[Any]] = []
     costs = []
     for time, point in enumerate(points):
@@ -56,7 +56,7 @@ def naive_costs(atoms: np.ndarray, points: np.ndarray, horizon: int) -> list[flo
 
 
 def test_coupling_by_hand() -> None:
-    """Three atoms for two steps: a step fills one and a half. The first takes 0 and half of 1; the rest is for the second."""
+    """Three atoms for two steps: each step fills 1.5 atoms. The first takes atom 0 and half of atom 1; the second, the rest."""
     assert np.allclose(GREEDY(column(0, 1, 5), column(0, 0), jnp.int32(2)), [(1 * 0 + 0.5 * 1) / 1.5, (0.5 * 1 + 1 * 5) / 1.5])
     assert np.allclose(GREEDY(column(0, 4), column(1, 2, 3, 9), jnp.int32(4)), [1, 2, 1, 5])
 
@@ -69,7 +69,7 @@ def test_coupling_by_hand() -> None:
     seed=st.integers(0, 999),
 )
 def test_costs_equal_those_of_a_naive_coupling_step_by_step(atoms: int, points: int, horizon: int, seed: int) -> None:
-    """Episodes as long as the horizon, shorter, and longer, where the atoms are empty again after it."""
+    """Episodes as long as the horizon, shorter, and longer, in which all capacity is restored after the horizon."""
     a, x = grid(atoms, seed), grid(points, seed + 1000)
     distances = np.asarray(GREEDY(jnp.asarray(a), jnp.asarray(x), jnp.int32(horizon)))
     assert np.allclose(distances / horizon, naive_costs(a, x, horizon), rtol=1e-5, atol=1e-7)
@@ -101,7 +101,7 @@ def test_the_greedy_coupling_costs_at_least_the_exact_one(atoms: int, horizon: i
 
 
 def test_distances_that_are_not_finite_end_too() -> None:
-    """A full atom must stay less attractive than one infinitely far away, or the loop would take it for ever."""
+    """A full atom must rank behind one that is infinitely far away, or the loop would choose it forever."""
     left, distance = MOVE(jnp.array([0, 4]), jnp.array([1.0, jnp.inf]))
     assert left.tolist() == [0, 2] and float(distance) > 1e37
     left, distance = MOVE(jnp.array([0, 4]), jnp.array([1.0, jnp.nan]))
@@ -123,7 +123,7 @@ EPISODE = random_batch(30, 3, 2, 5)
 
 @pytest.mark.parametrize("inputs", ["state", "state-action"])
 def test_reward_is_the_papers_formula(inputs: Any) -> None:
-    """`alpha exp(-beta T / sqrt(|S| + |A|) c)` of what StandardScaler would make of the demonstrations."""
+    """`alpha exp(-beta T / sqrt(|S| + |A|) c)` with the demonstrations standardised as by StandardScaler."""
 
     def rows(batch: Batch) -> np.ndarray:
         return np.concatenate([batch.obs, batch.action], axis=1) if inputs == "state-action" else batch.obs
@@ -150,7 +150,7 @@ def test_a_step_is_paid_by_what_came_before_it_and_not_by_what_comes_after() -> 
 
 
 def test_order_matters() -> None:
-    """The same steps in another order: who comes first takes the nearest atoms."""
+    """With the same steps in another order, the first step takes the nearest atoms."""
     order = np.random.default_rng(0).permutation(30)
     shuffled = reward_of(PWIL(), DEMOS, staying(EPISODE.obs[order], EPISODE.action[order]))
     assert not np.allclose(shuffled, reward_of(PWIL(), DEMOS, EPISODE)[order])
@@ -189,7 +189,7 @@ def test_the_horizon_is_that_of_the_longest_demonstration() -> None:
 
 
 def test_slow_features_are_those_of_the_trunk_at_its_last_turn() -> None:
-    """Until then those of the trunk at the start; the reward never sees the agent's trunk of now."""
+    """Until the first refresh, they are those of the initial trunk; the reward never uses the agent's current trunk."""
     trunks = [Trunk.init(3, 6, key=jax.random.key(seed)) for seed in range(4)]
     pwil = PWIL(inputs="trunk", refresh=2)
     nothing = Batch(*(array[:0] for array in batches(EPISODE)))

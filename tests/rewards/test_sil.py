@@ -1,4 +1,4 @@
-"""Sinkhorn rewards by a naive second computation; what fixes their scale, what learns, and when."""
+"""Sinkhorn rewards compared with a naive second computation; their scale, and the critic's updates."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def reward(settings: SinkhornReward, state: SinkhornState, batch: Batch, embed: 
 
 
 def naive_costs(x: np.ndarray, y: np.ndarray, epsilon: float = 0.01, rounds: int = 100) -> np.ndarray:
-    """Each step's part of the transport by cosines and logarithms, in float64."""
+    """Each step's part of the transport cost, by cosines and in the log domain, in float64."""
     x, y = (np.asarray(z, np.float64) / np.linalg.norm(z, axis=1, keepdims=True) for z in (x, y))
     cost = 1 - x @ y.T
     log_u, log_v = np.zeros(len(x)), np.zeros(len(y))
@@ -46,7 +46,7 @@ def mlp(network: MLP, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("inputs", ["state", "state-action"])
 def test_sil_pays_minus_the_cost_to_one_random_demonstration(inputs: Any) -> None:
-    """Every demonstration has its turn, each compared whole and without its padding."""
+    """Every demonstration is drawn at some time, and each is compared as a whole, without its padding."""
     sil = SIL(inputs=inputs)
     state = sil.init(DEMOS, TRUNKS[0], key=KEY)
 
@@ -66,7 +66,7 @@ def test_sil_pays_minus_the_cost_to_one_random_demonstration(inputs: Any) -> Non
 
 @pytest.mark.parametrize("near", [0, 1, 2])
 def test_potil_pays_minus_the_cost_to_the_nearest_demonstration(near: int) -> None:
-    """Nearest as a whole: the largest sum of rewards, not the largest reward at each step."""
+    """The nearest as a whole: the largest sum of rewards, not the largest reward at each step."""
     potil = POTIL()
     state = potil.init(DEMOS, TRUNKS[0], key=KEY)
     episode = staying(DEMOS[near].obs[:10] + 0.1, DEMOS[near].action[:10])
@@ -94,7 +94,7 @@ def episode_of(batch: Batch) -> Episode:
 
 @pytest.mark.parametrize("method", ["sil", "potil"])
 def test_the_first_episode_fixes_the_scale_of_all(method: str) -> None:
-    """Its own rewards sum to -10; the next episode is paid by the same scale."""
+    """Its own rewards sum to -10; the next episode has the same scale."""
     run = run_of(method)
     first, second = (episode_of(random_batch(steps, 2, 2, seed)) for steps, seed in ((20, 1), (25, 2)))
     fresh = learner.init(run.learner, Spec(2, 2, 1), [random_batch(30, 2, 2, 5), random_batch(20, 2, 2, 6)], 0)
@@ -126,14 +126,14 @@ def test_steps_share_the_mass_and_rows_behind_them_have_none() -> None:
 
 
 class Free(POTIL):
-    """Every episode costs nothing at all."""
+    """Every episode has a cost of 0."""
 
     def costs(self, state: Any, batch: Any, embed: Any, *, key: Any) -> jax.Array:
         return jnp.zeros(len(batch.obs))
 
 
 def test_a_first_episode_that_costs_nothing_leaves_a_finite_scale() -> None:
-    """As if it had cost a millionth."""
+    """The scale is that of a cost of one millionth."""
     state = SinkhornState(Demos.of(DEMOS), jnp.zeros(()), None)
     after = Free().after_episode(state, EPISODE, TRUNKS[0], key=KEY)
     assert float(after.scale) == pytest.approx(10 / 1e-6)
@@ -155,7 +155,7 @@ def test_a_reward_of_single_steps_takes_no_note_of_episodes() -> None:
 
 
 def test_the_critics_gradient_is_that_of_the_cost_with_the_plan_held_fixed() -> None:
-    """Against finite differences in float64, along random directions of all weights together."""
+    """Compared with finite differences in float64, along random directions of all weights together."""
     rng = np.random.default_rng(0)
     critic = MLP.init((6, 16, 16, 5), key=KEY)
     x, y, plan = rng.standard_normal((9, 6)), rng.standard_normal((9, 6)), rng.random((9, 9))
@@ -175,7 +175,7 @@ def test_the_critics_gradient_is_that_of_the_cost_with_the_plan_held_fixed() -> 
 
 
 def pair(rows: int = 32) -> tuple[Batch, Batch]:
-    """An expert and an agent that live apart, but not far."""
+    """An expert and an agent whose states are apart, but not far."""
     expert, agent = random_batch(rows + 1, 3, 2, 1), random_batch(rows + 1, 3, 2, 2)
     return batches(staying(expert.obs + 1, expert.action)), batches(agent)
 

@@ -1,4 +1,4 @@
-"""TCN's loss against hand-computed numbers and naive loops, and which states of a window it compares."""
+"""TCN's loss compared with hand-computed numbers and naive loops, and the states of a window that it compares."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def naive(anchor: np.ndarray, positive: np.ndarray, negatives: list[np.ndarray],
 
 
 def test_each_state_finds_the_next_one_among_those_of_all_other_rows() -> None:
-    """Naive loops over a mix of 32 expert and 32 agent rows; all are anchors, whoever they are from."""
+    """Naive loops over a mixture of 32 expert and 32 agent rows, all of which are anchors."""
     expert, agent = drawn(1, 1), drawn(2, 1)
     obs = np.concatenate([states(expert), states(agent)])
     anchor, positive = phi(obs[:, 0]), phi(obs[:, 1])
@@ -91,7 +91,7 @@ def test_two_rows_by_hand() -> None:
 
 
 def test_a_rollouts_own_negatives_by_hand() -> None:
-    """Temperature 0.5, anchor and positive (1, 0), far states (0, 1) and, behind the end, (1, 0), which counts as -1.
+    """Temperature 0.5, anchor and positive (1, 0), far states (0, 1) and, after the end, (1, 0), which counts as -1.
 
     -2 + log(e^2 + e^0 + e^-2) = 0.142932.
     """
@@ -102,7 +102,7 @@ def test_a_rollouts_own_negatives_by_hand() -> None:
 
 
 def test_negatives_of_the_same_rollout_are_those_from_the_margin_to_twice_the_margin() -> None:
-    """Naive loops; with `window = 1` the positive is the next state, and rows of other windows play no part."""
+    """Naive loops; with `window = 1` the positive is the next state, and rows of other windows have no effect."""
     settings = narrow(TCN(temperature=0.5, negatives="rollout", margin=3))
     expert, agent = drawn(1, 6), drawn(2, 6)
     obs = np.concatenate([states(expert), states(agent)])
@@ -114,7 +114,7 @@ def test_negatives_of_the_same_rollout_are_those_from_the_margin_to_twice_the_ma
 
 @pytest.mark.parametrize("end", [3, 4, 5, 6])
 def test_what_lies_behind_a_termination_is_no_negative(end: int) -> None:
-    """Windows that terminate with step `end - 1`, so that state `end` is the last: what stands behind it changes nothing.
+    """Windows that terminate with step `end - 1`, so that state `end` is the last: later rows change nothing.
 
     The last state itself does count.
     """
@@ -131,7 +131,7 @@ def test_what_lies_behind_a_termination_is_no_negative(end: int) -> None:
 
 
 def test_positives_are_at_most_so_many_steps_away_and_all_of_them_occur() -> None:
-    """States turn by 0.5 a step, so the cosine with the anchor says how far the positive is: 1, 2 or 3 steps."""
+    """States turn by 0.5 in each step, so the cosine with the anchor shows the distance to the positive: 1, 2 or 3 steps."""
     angle = np.arange(4, dtype=np.float32) / 2
     obs = np.tile(np.stack([np.cos(angle), np.sin(angle)], axis=1), (500, 1, 1))
     ones = np.ones((500, 3), np.float32)
@@ -148,7 +148,7 @@ def test_positives_are_at_most_so_many_steps_away_and_all_of_them_occur() -> Non
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROLLOUT], ids=["batch", "rollout"])
 def test_nothing_says_which_rows_are_the_experts(settings: TCN) -> None:
-    """With expert and agent in each other's place the loss is the same. (With one step to choose from: no draw is involved.)"""
+    """If expert and agent are exchanged the loss is the same. (With a window of one step, so that nothing is drawn.)"""
     settings = narrow(TCN(temperature=0.5, negatives=settings.negatives, margin=3))
     one, two = drawn(1, 6), drawn(2, 6)
     first, second = (metrics_of(settings, *pair) for pair in ((one, two), (two, one)))
@@ -165,7 +165,7 @@ def test_windows_that_are_longer_than_needed_are_cut() -> None:
 
 @pytest.mark.parametrize("settings", [SETTINGS, ROLLOUT], ids=["batch", "rollout"])
 def test_neighbours_in_time_come_closer_than_strangers(settings: TCN) -> None:
-    """On random walks: after 100 updates the next state is nearer, by cosine, than a state ten steps on."""
+    """On random walks: after 100 updates the next state is nearer, by cosine, than a state ten steps later."""
     settings = narrow(settings, learning_rate=1e-2)
     rng = np.random.default_rng(0)
     steps = rng.normal(size=(2, 60, 6))
@@ -188,4 +188,4 @@ def test_the_span_is_what_the_furthest_state_needs() -> None:
 def test_a_margin_within_the_window_is_refused(margin: int) -> None:
     with pytest.raises(InputError, match=rf"TCN.margin is {margin}; it must be at least 3"):
         TCN(negatives="rollout", window=2, margin=margin)
-    assert TCN(window=2, margin=margin).margin == margin, "without negatives of the same rollout it plays no part"
+    assert TCN(window=2, margin=margin).margin == margin, "without negatives of the same rollout it has no effect"

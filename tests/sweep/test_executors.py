@@ -1,4 +1,4 @@
-"""Where runs are trained: each has its threads, its cores and its GPUs, and ends when its sweep asks or is gone."""
+"""Executors: each run has its own threads, cores and GPUs, and ends when its sweep asks or has ended."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ print("asked", flush=True)
 
 @pytest.fixture
 def echo(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In place of a run: what it was given, until its input ends."""
+    """Replaces a run: it prints its arguments and environment, and ends when its input does."""
     monkeypatch.setattr(executors, "WORKER", (sys.executable, "-c", ECHO))
     for name in ("XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES"):
         monkeypatch.delenv(name, raising=False)
@@ -88,7 +88,7 @@ def test_a_killed_process_is_named_by_its_signal_and_the_end_of_the_sweep_kills_
     ],
 )
 def test_runs_take_the_gpus_in_turn(gpus: float, room: int, given: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five runs, the second of which has ended when the fifth begins."""
+    """Five runs; the second has ended when the fifth begins."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "a,b")
     monkeypatch.setattr(executors, "cores", lambda: 100)
     asked = plan(f"gpus = {gpus}\n{HARMLESS}")
@@ -134,7 +134,7 @@ def test_a_machine_without_room_for_a_run_is_said(text: str, limit: int | None, 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1" if "3" in text else "")
     with pytest.raises(InputError, match=r"this machine gives 7 cores and [02] GPUs; lower cores or gpus"):
         executors.Local(plan(f"{text}\n{HARMLESS}"), limit)
-    executors.Local(plan(f"cores = 8\n{HARMLESS}"), 1)  # slower than it could be, but asked for
+    executors.Local(plan(f"cores = 8\n{HARMLESS}"), 1)  # slower than necessary, but requested
 
 
 # --- A run's process ---
@@ -150,12 +150,12 @@ def test_a_worker_waits_for_the_one_that_it_replaces(tmp_path: Path, monkeypatch
     with (tmp_path / ".lock").open("w") as forever:
         fcntl.flock(forever, fcntl.LOCK_EX)
         monkeypatch.setattr(worker, "PATIENCE_SECONDS", 0.01)
-        worker._wait_until_free(tmp_path / ".lock")  # and comes back
+        worker._wait_until_free(tmp_path / ".lock")  # returns after the timeout
 
 
 def test_runs_of_one_machine_have_cores_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three runs of two cores on five: the third finds one free, takes none, and has its turn when a run has ended."""
-    bound, machine = [], os.getpid() << 8  # cores that no real run has
+    """Three runs with two cores each on five cores: the third finds only one and is not bound, until a run has ended."""
+    bound, machine = [], os.getpid() << 8  # numbers that no real core has
     five = {machine + core for core in range(5)}
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: five)
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append({core - machine for core in cores}))
@@ -163,7 +163,7 @@ def test_runs_of_one_machine_have_cores_of_their_own(monkeypatch: pytest.MonkeyP
     assert bound == [{0, 1}, {2, 3}]
     first.close()
     with worker.own_cores(3), worker.own_cores(1):
-        assert bound == [{0, 1}, {2, 3}, {0, 1, 4}], "for the last one nothing is left"
+        assert bound == [{0, 1}, {2, 3}, {0, 1, 4}], "no core is left for the last one"
     second.close()
     third.close()
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
@@ -194,7 +194,7 @@ def test_second_threads_of_a_core_are_taken_last(
 
 
 def test_a_killed_run_frees_its_core(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other process binds as this one does, but says so on a line."""
+    """The other process reserves its core in the same way, and then prints a line."""
     core, bound = (os.getpid() << 8) + 7, []
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {core})
     monkeypatch.setattr(os, "sched_setaffinity", lambda _, cores: bound.append(cores))

@@ -1,4 +1,4 @@
-"""Sweeps: a file gives the runs that it says; stopped or killed, they end as if left alone; a bad one harms no other."""
+"""Sweeps: a file gives the runs it describes; interrupted runs end like uninterrupted ones; a failed run affects no other."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ agent.noise.steps = 1000
 reward.hidden = 16
 reward.batch_size = 32
 """
-"""`small.small_run` as settings, so that both share one compilation; dotted names with quotes and without."""
+"""`small.small_run` as settings, so that both share one compilation; dotted names with and without quotes."""
 PRODUCT = f"tasks = ['{POINT_MASS}']\nmethods = ['pcil']\nseeds = [1, 2]\nframes = 300\n"
 
 
@@ -56,13 +56,13 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def plan(text: str, out: str = "out", trust: Sequence[str] = ()) -> plans.Plan:
-    """What a file with this text asks for."""
+    """The plan of a file with this text."""
     Path("sweep.toml").write_text(text)
     return plans.read(Path("sweep.toml"), Path(out), trust)
 
 
 ANY_LABEL = sorted(name for name, kind in REWARDS.items() if kind.scope == "step")
-"""Methods that take either label."""
+"""Methods that accept both values of `label`."""
 
 # --- The file ---
 
@@ -77,7 +77,7 @@ ANY_LABEL = sorted(name for name, kind in REWARDS.items() if kind.scope == "step
 def test_the_file_gives_every_combination_once(
     tasks: list[str], methods: list[str], seeds: list[int], labels: list[str]
 ) -> None:
-    """Against four plain loops; what a run is follows from where its folder is."""
+    """Compared with four plain loops; the folder determines the run."""
     text = f"tasks = {tasks}\nmethods = {methods}\nseeds = {seeds}\n"
     text += "".join(f"[variants.{label}_]\nlabel = '{label}'\n" for label in labels)
     with mock.patch.object(runs, "check"):
@@ -133,7 +133,7 @@ def test_a_file_may_hold_nothing_but_further_runs() -> None:
 
 WHOLE = "tasks = ['pendulum_swingup']\nmethods = ['pcil']\nseeds = [1]\n"
 BAD = [
-    # the file, what the sentence must hold
+    # the file, text that the message must contain
     ("tasks = [", "can't be read as TOML"),
     ("", "has no runs"),
     ("frames = 5000", "has no runs"),
@@ -196,7 +196,7 @@ def test_a_folder_with_other_settings_is_refused_even_if_it_is_done(demos: str) 
 
 
 def planned(*words: str) -> list[plans.Job]:
-    """What `pcil sweep` with these words would train."""
+    """The plan of `pcil sweep` with these arguments."""
     with mock.patch.object(sweep, "sweep", return_value=0) as started:
         assert cli.main(["sweep", *words, "--out", "out"]) == 0
     return started.call_args.args[0].jobs
@@ -246,7 +246,7 @@ def test_words_that_name_no_runs_are_one_sentence(words: list[str], said: str, c
     assert not Path("out").exists()
 
 
-# --- What is read from the folders, and shown ---
+# --- The state of the runs, as read from the folders and shown ---
 
 
 def test_the_folder_says_how_a_run_stands(demos: str) -> None:
@@ -255,7 +255,7 @@ def test_the_folder_says_how_a_run_stands(demos: str) -> None:
     with contextlib.suppress(loop.Stopped):
         runs.execute(stopped.run, stopped.folder, [StopAfter(4)])
     with (stopped.folder / "train.jsonl").open("a") as file:
-        file.write('{"frames": 99')  # a line that is being written
+        file.write('{"frames": 99')  # an incomplete line
     stopped, untouched = plan(text).jobs
     assert (untouched.state, untouched.frames) == ("waiting", 0)
     assert (stopped.state, stopped.frames) == ("waiting", 200) and stopped.rate > 0
@@ -305,13 +305,13 @@ def test_where_room_is_short_the_running_runs_are_shown() -> None:
     assert [line.split()[3:5] for line in screen.file.getvalue().splitlines()[1:3]] == [["4", "running"], ["1", "waiting"]]
 
 
-# --- The seam: whatever trains the runs ---
+# --- The interface of executors ---
 
 HARMLESS = "[[runs]]\ntasks = ['pendulum_swingup']\nmethods = ['expert']\nseeds = [1, 2, 3, 4, 5]\nframes = 4000"
 
 
 class Pretended:
-    """An executor without processes. `ends` are those of each seed, one after the other; then a run ends well, with a DONE."""
+    """An executor without processes. A run ends with each of its seed's `ends` in turn, and then successfully, with a DONE."""
 
     def __init__(self, room: int, ends: dict[int, list[int | str]] | None = None) -> None:
         self.running: list[plans.Job] = []
@@ -348,7 +348,7 @@ class Pretended:
 
 
 def train_all(executor: Pretended, jobs: list[plans.Job], limit: int | None = None, stop: bool = False) -> list[str]:
-    """What is said; a signal comes once all have been started that there is room for, if `stop`."""
+    """The messages; if `stop`, a signal arrives once as many runs have been started as possible."""
     signals, said = progress.Signals(lambda: None), []
     with mock.patch.object(sweep, "PAUSE_SECONDS", 0.0), mock.patch.object(sweep, "VISIBLE_SECONDS", 0.0):
         for text in sweep._train_all(executor, jobs, limit, signals):
@@ -394,7 +394,7 @@ def test_a_signal_stops_what_runs_and_starts_nothing_more(end: int | str) -> Non
 
 
 def test_a_run_that_ended_where_nobody_sees_it_has_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a node whose storage is its own."""
+    """As on a node whose storage is not shared."""
     monkeypatch.setattr(sweep, "VISIBLE_SECONDS", 0.0)
     job = plan(HARMLESS).jobs[0]
     state, said = sweep._outcome(job, 0, stopping=False)
@@ -404,37 +404,37 @@ def test_a_run_that_ended_where_nobody_sees_it_has_failed(monkeypatch: pytest.Mo
     assert sweep._outcome(job, 0, stopping=False)[0] == "done"
 
 
-# --- From end to end ---
+# --- End to end ---
 
 
 class Session:
-    """Processes in a session of their own: seen as a whole, and gone at the end."""
+    """Processes in a separate session, which are observed as a whole and ended afterwards."""
 
     def __init__(self, folder: Path) -> None:
-        """Bytecode is kept, for Ray starts a dozen interpreters, and has 15 seconds for some of them."""
+        """Bytecode is cached, because Ray starts a dozen interpreters and allows 15 seconds for some of them."""
         self.environment = dict(os.environ, PYTHONPYCACHEPREFIX=str(folder / "bytecode"))
         self.environment.pop("PYTHONDONTWRITEBYTECODE", None)
         self.leaders: list[subprocess.Popen[str]] = []
 
     def start(self, *words: str) -> subprocess.Popen[str]:
-        """Python with these words."""
+        """Start Python with these arguments."""
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
         command = [sys.executable, *words]
         self.leaders.append(subprocess.Popen(command, **pipes, text=True, env=self.environment, start_new_session=True))
         return self.leaders[-1]
 
     def members(self) -> list[int]:
-        """All processes that live, and whose session is one of ours."""
+        """All living processes whose session is one of ours."""
         found = []
         for stat in Path("/proc").glob("[0-9]*/stat"):
-            with contextlib.suppress(OSError):  # it has ended meanwhile
+            with contextlib.suppress(OSError):  # it has ended in the meantime
                 state, _, _, session = stat.read_text().rpartition(")")[2].split()[:4]
                 if state != "Z" and int(session) in [leader.pid for leader in self.leaders]:
                     found.append(int(stat.parent.name))
         return found
 
     def ends(self) -> bool:
-        """Whether all of them end by themselves, however busy the machine is."""
+        """Whether all of them end by themselves, with time for a busy machine."""
         end = time.monotonic() + 400
         while self.members() and time.monotonic() < end:
             time.sleep(0.1)
@@ -458,7 +458,7 @@ def session(bytecode: Path) -> Iterator[Session]:
 
 
 def until(true: Callable[[], bool], process: subprocess.Popen[str], seconds: float = 400) -> None:
-    """Wait while the process is going, and fail with what it printed where it ends before."""
+    """Wait for a condition while the process runs; if it ends first, fail with its output."""
     end = time.monotonic() + seconds
     while not true():
         if process.poll() is not None or time.monotonic() > end:
@@ -479,8 +479,8 @@ def process_of(job: plans.Job) -> int:
 
 @contextlib.contextmanager
 def held(jobs: list[plans.Job], process: subprocess.Popen[str]) -> Iterator[None]:
-    """All of them after their third episode, or one more than they have: whichever is there first stands still, and none ends
-    before another has begun."""
+    """Pauses each run after its third episode, or after one more than it has, so that no run ends before all others have
+    reached that point."""
     still, wanted = {}, {job.name: max(episodes(job) + 1, 3) for job in jobs}
 
     def arrived() -> bool:
@@ -500,13 +500,13 @@ def held(jobs: list[plans.Job], process: subprocess.Popen[str]) -> Iterator[None
 
 
 def contents(job: plans.Job) -> dict[Path, tuple[int, bytes]]:
-    """Every file of its folder, with the time of its last change."""
+    """Every file of its folder, with its modification time."""
     files = [path for path in job.folder.rglob("*") if path.is_file()]
     return {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
 
 
 def saved(job: plans.Job) -> int:
-    """Frames of the newest checkpoint."""
+    """Frames of the latest checkpoint."""
     return checkpoint.restore(job.folder / "checkpoint")[1]["counters"]["frames"]
 
 
@@ -550,7 +550,7 @@ def ray_variables(session: Session) -> None:
 def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(
     place: str, demos: str, session: Session, tmp_path: Path
 ) -> None:
-    """Four runs: two that Ctrl-C stops, one that is done, one that fails; without Ray where it is not asked for."""
+    """Four runs: two are stopped by Ctrl-C, one is finished, and one fails. Ray is not needed unless it is requested."""
     Path("spy_reward.py").write_text(SPY)
     text = f"{PRODUCT.replace('300', '15000')}[settings]\ndemos = '{demos}'\n{NARROW.replace('every = 100', 'every = 1000')}"
     text += "[[runs]]\nseeds = [3]\nframes = 300\n[[runs]]\nseeds = [1]\nvariants.spy.reward = 'spy_reward:Spy'\n"
@@ -565,7 +565,7 @@ def test_a_sweep_may_be_stopped_and_repeated_and_a_bad_run_harms_no_other(
 
     process = session.start(*words)
     with held([one, two], process):
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        os.killpg(process.pid, signal.SIGINT)  # as from a terminal
     printed, _ = process.communicate(timeout=400)
     assert process.returncode == 130 and "the same command goes on from here" in printed
     for job in (one, two):
@@ -607,7 +607,7 @@ cluster.shutdown()
 @pytest.mark.slow
 @pytest.mark.usefixtures("ray_variables")
 def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, tmp_path: Path) -> None:
-    """Two nodes with a core each. One run's worker is killed, then the other run's whole node: all end as if left alone."""
+    """Two nodes with a core each. The worker of one run and then the node of the other are killed; both runs end normally."""
     text = f"{PRODUCT.replace('[1, 2]', '[1, 2, 3]').replace('300', '6000')}[settings]\ndemos = '{demos}'\n"
     jobs = plan(f"{text}checkpoint_seconds = 0\n{NARROW.replace('every = 100', 'every = 2000')}").jobs
     nodes = session.start("-c", NODES)
@@ -638,7 +638,7 @@ def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, 
 
 @pytest.mark.slow
 def test_whatever_is_killed_the_same_command_finishes_everything(demos: str, session: Session, tmp_path: Path) -> None:
-    """A run, then the sweep itself, then every process at once, as when the machine goes down; nothing is left behind."""
+    """Kills a run, then the sweep itself, then all processes at once, as if the machine went down; nothing is left behind."""
     text = f"{PRODUCT.replace('300', '10000')}[settings]\ndemos = '{demos}'\ncheckpoint_seconds = 0\n"
     jobs = plan(f"{text}{NARROW.replace('every = 100', 'every = 2000')}").jobs
     words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]

@@ -1,4 +1,4 @@
-"""Theorem 1: its bounds, where it fails, and the two optimisers, each against a second way to the same number."""
+"""Theorem 1: its bounds, where it fails, and the two optimisers, each compared with a second computation."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from pcil.nets.optimiser import adam_init, adam_step
 
 law = settings(deadline=None, derandomize=True, max_examples=40)
 EXACT = 1e-12
-"""Rounding errors of sums of a few probabilities."""
+"""Tolerance for rounding errors in sums of a few probabilities."""
 SOLVED = 1e-6
-"""Error of the ascent that a thousand sweeps may leave where it is slow."""
+"""Tolerance for the error that a thousand sweeps of the ascent leave if it is slow."""
 
 
 def normalised(numbers: list[float]) -> np.ndarray:
@@ -36,7 +36,7 @@ def normalised(numbers: list[float]) -> np.ndarray:
 
 
 def distributions(atoms: int) -> st.SearchStrategy[np.ndarray]:
-    """Probabilities of that many atoms, some of them 0."""
+    """Probabilities of this number of atoms, some of them 0."""
     number = st.one_of(st.just(0.0), st.floats(0.001, 1.0))
     return st.lists(number, min_size=atoms, max_size=atoms).filter(lambda numbers: sum(numbers) > 0).map(normalised)
 
@@ -56,7 +56,7 @@ def random_embedding(*shape: int, seed: int = 0) -> np.ndarray:
 
 
 def naive_objective(phi: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
-    """The paper's game, sample by sample: the expert's mean reward minus the policy's, the reward that of Eq. 2."""
+    """The paper's game, sample by sample: the expert's mean reward minus the policy's, with the reward of Eq. 2."""
     rewards = [sum(p[j] * float(phi[i] @ phi[j]) for j in range(len(p))) for i in range(len(p))]
     return sum(p[i] * rewards[i] for i in range(len(p))) - sum(q[i] * rewards[i] for i in range(len(p)))
 
@@ -75,7 +75,7 @@ def test_neither_value_exceeds_twice_the_total_variation(pair: tuple[np.ndarray,
 @law
 @given(st.floats(0.001, 0.999))
 def test_twice_the_total_variation_is_reached_for_every_mass(mass: float) -> None:
-    """Nearly: the policy leaves S for a place of its own, and elsewhere it is barely above the expert."""
+    """Up to a small error: the policy leaves S for a state that the expert never visits, and elsewhere barely exceeds it."""
     shift = mass / 1e6
     p, q = np.array([mass, 1 - mass, 0]), np.array([0, 1 - mass + shift, mass - shift])
     assert theory.expert_mass(p, q) == mass
@@ -92,7 +92,7 @@ def test_distributions_that_do_not_meet_are_at_two() -> None:
 @given(PAIRS)
 @example(theory.COUNTER_EXAMPLE)
 def test_with_halved_atoms_the_lower_bound_always_holds(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    """By the ascent alone, which knows neither the relaxed optimum nor the embedding that has it; the sharper bound too."""
+    """By the ascent alone, which uses neither the relaxed optimum nor its embedding; the sharper bound holds too."""
     tv, mass = theory.total_variation(*pair), theory.expert_mass(*pair)
     reached = theory.attained(theory.halved(pair[0]), theory.halved(pair[1]))[0]
     assert reached >= theory.LOWER * tv - EXACT
@@ -100,7 +100,7 @@ def test_with_halved_atoms_the_lower_bound_always_holds(pair: tuple[np.ndarray, 
 
 
 def test_the_counter_example_is_one() -> None:
-    """D_cont is 0 by a certificate, with the total variation at a quarter; a coin makes it a third of that."""
+    """D_cont is 0 by a certificate, while the total variation is 1/4; with halved atoms D_cont is a third of that."""
     p, q = theory.COUNTER_EXAMPLE
     value, phi = theory.attained(p, q)
     assert theory.total_variation(p, q) == 0.25
@@ -110,7 +110,7 @@ def test_the_counter_example_is_one() -> None:
 
 
 def test_the_papers_first_case_has_counter_examples_too() -> None:
-    """P = 1/2 is its case 1: an expert at two places, a policy that misses one of them."""
+    """P = 1/2 belongs to its case 1: an expert in two states, and a policy that misses one of them."""
     p, q = np.array([0.5, 0.5]), np.array([0.0, 1.0])
     value, phi = theory.attained(p, q)
     assert theory.expert_mass(p, q) == 0.5 == theory.total_variation(p, q)
@@ -120,7 +120,7 @@ def test_the_papers_first_case_has_counter_examples_too() -> None:
 @law
 @given(PAIRS)
 def test_what_holds_with_atoms(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    """max(2 (2P - 1), 0) always, so 0.25 from P = 9/16; and the sharper bound where no atom outweighs the rest off S."""
+    """max(2 (2P - 1), 0) always, so 0.25 for P >= 9/16; and the sharper bound if no atom outweighs the others off S."""
     p, q = pair
     tv, mass, value = theory.total_variation(p, q), theory.expert_mass(p, q), theory.attained(p, q)[0]
     assert value >= theory.bound_with_atoms(mass) * tv - EXACT
@@ -136,13 +136,13 @@ def test_what_holds_with_atoms(pair: tuple[np.ndarray, np.ndarray]) -> None:
     [(7 / 32, (5, 6, 8, 12), lambda mass: np.full_like(mass, theory.LOWER)), (1 / 8, (9, 10, 16), theory.sharper_bound)],
 )
 def test_a_cap_on_the_experts_atoms_is_enough_for_every_policy(largest: float, atoms: tuple[int, ...], bound: Any) -> None:
-    """0.25 from 7/32 down, the sharper bound from 1/8 down; the policy is ahead at one to three states of any weight."""
+    """0.25 up to 7/32, the sharper bound up to 1/8; the policy exceeds the expert in one to three states of any weight."""
     rng = np.random.default_rng(0)
     for number in atoms:
         p = rng.dirichlet(np.full(number, 0.5), 60)
         cut = np.minimum(p, largest)
         room = largest - cut
-        p = cut + room * ((1 - cut.sum(axis=-1)) / room.sum(axis=-1))[:, None]  # what was cut off fills up the others
+        p = cut + room * ((1 - cut.sum(axis=-1)) / room.sum(axis=-1))[:, None]  # the others get the mass that was cut off
         assert p.max() <= largest + EXACT
         ahead = np.arange(number) >= number - rng.integers(1, 4, (len(p), 1))
         q = np.where(ahead, p, p * rng.uniform(0, 1, (len(p), 1)))
@@ -152,7 +152,7 @@ def test_a_cap_on_the_experts_atoms_is_enough_for_every_policy(largest: float, a
 
 
 def test_where_an_atom_weighs_more_than_the_rest_off_s_the_cap_leaves_p_above_nine_sixteenths() -> None:
-    """The step of the proof, at its edge: an atom of 7/32 with just less than that beside it off S."""
+    """The limiting case of the proof: an atom of 7/32 beside slightly less mass off S."""
     p = np.array([*np.full(4, 9 / 64), 7 / 32, 7 / 32 - 1e-9, 1e-9])
     assert p.sum() == 1 and p[4] > p[4:].sum() / 2 * (1 - 1e-8)
     q = np.array([*np.zeros(4), 0.5, 0.4, 0.1])
@@ -161,7 +161,7 @@ def test_where_an_atom_weighs_more_than_the_rest_off_s_the_cap_leaves_p_above_ni
 
 
 def test_an_expert_without_a_dominant_state_may_fall_below_the_sharper_bound() -> None:
-    """Uniform on three states, and a policy that is always in one of them: 2/3, where the bound would say 3/4."""
+    """Uniform on three states, and a policy that is always in one of them: 2/3, where the bound would be 3/4."""
     p, q = np.full(3, 1 / 3), np.array([0.0, 0.0, 1.0])
     value, phi = theory.attained(p, q)
     tv, mass = theory.total_variation(p, q), theory.expert_mass(p, q)
@@ -172,7 +172,7 @@ def test_an_expert_without_a_dominant_state_may_fall_below_the_sharper_bound() -
 
 
 def test_demonstrations_that_a_policy_never_meets_are_at_two_whatever_the_policy() -> None:
-    """Recorded states and a policy that comes near them but never to one: TV is 1 and D_cont 2, for near and far alike."""
+    """Recorded states and a policy that never visits exactly one of them: TV is 1 and D_cont 2, at every distance."""
     p, q = np.repeat([[1 / 50], [0.0]], 50, axis=1).ravel(), np.repeat([[0.0], [1 / 50]], 50, axis=1).ravel()
     assert theory.total_variation(p, q) == pytest.approx(1)
     assert theory.attained(p, q)[0] == pytest.approx(2) == theory.relaxed(p, q)[0]
@@ -181,7 +181,7 @@ def test_demonstrations_that_a_policy_never_meets_are_at_two_whatever_the_policy
 @law
 @given(PAIRS, st.integers(0, 99))
 def test_a_function_with_a_negative_mean_is_no_coordinate_along_v(pair: tuple[np.ndarray, np.ndarray], seed: int) -> None:
-    """Off the axis the rest cancels, so v = (A, 0): with A below 0 it points the other way, and A is not its length."""
+    """The other coordinates cancel, so v = (A, 0): if A is below 0, it points the other way and A is not its length."""
     p, _ = pair
     g = np.random.default_rng(seed).uniform(-1, 1, len(p))
     v = theory.halved(p) @ theory.halves_embedding(g)
@@ -224,7 +224,7 @@ def test_the_papers_second_case_is_below_zero(pair: tuple[np.ndarray, np.ndarray
 
 @pytest.mark.parametrize(("mass", "printed", "true"), [(0.1, 1.6, 0.27778), (0.001, 1.996, 0.25025)])
 def test_the_printed_objective_is_larger_than_the_divergence(mass: float, printed: float, true: float) -> None:
-    """With alpha = |A| for A, as step 1 has it, g = (1, -1) is worth up to eight times as much as any embedding."""
+    """With alpha = |A| instead of A, as in step 1, the value of g = (1, -1) is up to eight times that of any embedding."""
     p, q, g = np.array([mass, 1 - mass]), np.array([0.0, 1.0]), np.array([1.0, -1.0])
     assert abs(g @ p) * (g @ (p - q)) / mass == pytest.approx(printed)
     assert theory.relaxed(p, q)[0] / mass == pytest.approx(true, abs=1e-5)
@@ -245,7 +245,7 @@ def test_two_atoms(first: float, second: float) -> None:
 @law
 @given(st.integers(1, 4), st.integers(1, 4), st.floats(0.001, 0.999), st.floats(0, 1), st.integers(0, 99))
 def test_two_likelihood_ratios(on: int, off: int, mass: float, share: float, seed: int) -> None:
-    """However many atoms there are, the best g has one value on S and one off it: the sharper bound is the value."""
+    """For any number of atoms, the best g has one value on S and one off it, so the sharper bound is the exact value."""
     rng = np.random.default_rng(seed)
     parts = rng.dirichlet(np.ones(on)), rng.dirichlet(np.ones(off))
     p, q = (np.concatenate([x * parts[0], (1 - x) * parts[1]]) for x in (mass, mass * share))
@@ -285,7 +285,7 @@ def test_the_divergence_is_not_symmetric() -> None:
 @law
 @given(st.integers(1, 5).flatmap(lambda atoms: st.tuples(distributions(atoms), distributions(atoms))))
 def test_the_relaxed_optimum_is_that_of_all_edges_of_the_cube(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    """Every g with one level free and the others at -1 or 1, ordered or not, the free one on a fine grid."""
+    """Every g with one free level on a fine grid and the others at -1 or 1, ordered or not."""
     p, q = pair
     levels, best = np.linspace(-1, 1, 2001), -np.inf
     for free, signs in itertools.product(range(len(p)), itertools.product([-1.0, 1.0], repeat=len(p))):
@@ -307,7 +307,7 @@ def test_no_other_function_does_better() -> None:
 @law
 @given(PAIRS)
 def test_the_optimum_is_a_threshold_of_the_likelihood_ratio(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    """g has the value; it is 1 where p / q is above A / (A + B) and -1 below, and one atom at most lies between."""
+    """g attains the value; it is 1 where p / q is above A / (A + B) and -1 below, and at most one atom lies in between."""
     p, q = pair
     value, g = theory.relaxed(p, q)
     a, b = float(g @ p), float(g @ (p - q))
@@ -336,7 +336,7 @@ def test_neither_order_nor_halves_matter(pair: tuple[np.ndarray, np.ndarray], ra
 @law
 @given(PAIRS)
 def test_true_is_at_most_relaxed_and_equal_with_halves(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    """Twice: by the ascent on halved atoms, and by the embedding that is made for them."""
+    """Two ways: by the ascent on halved atoms, and by the embedding constructed for them."""
     p, q = pair
     cut = theory.halved(p), theory.halved(q)
     value, g = theory.relaxed(p, q)
@@ -367,7 +367,7 @@ def test_the_objective_is_the_papers_game() -> None:
 
 
 def test_true_equals_a_search_of_the_plane() -> None:
-    """Three unit vectors in a plane, the first one fixed: all angles of the others, in steps of two degrees."""
+    """Three unit vectors in a plane, of which the first is fixed: all angles of the others, in steps of two degrees."""
     angles = np.arange(0, 2 * np.pi, np.pi / 90)
     second, third = (grid.ravel() for grid in np.meshgrid(angles, angles))
     at = np.stack([np.zeros_like(second), second, third], axis=-1)
@@ -376,12 +376,12 @@ def test_true_equals_a_search_of_the_plane() -> None:
     best = [np.max(theory.objective(phi, *(np.tile(x, (len(at), 1)) for x in row))) for row in zip(p, q, strict=True)]
     values, found = theory.attained(p, q)
     ranks = np.linalg.matrix_rank(found, tol=1e-3)
-    assert set(ranks) == {1, 2}, "both kinds of optimum are among them, and none needs the third dimension"
+    assert set(ranks) == {1, 2}, "both kinds of optimum occur, and none needs the third dimension"
     assert np.all(best <= values + EXACT) and np.all(values <= np.array(best) + 0.001)
 
 
 def test_the_best_of_the_starts_counts_even_if_it_has_not_arrived() -> None:
-    """Without a sweep the starts differ; what is returned is the best of them with its own embedding."""
+    """Without sweeps the starts differ; the best of them is returned with its embedding."""
     p, q = (weights[0] for weights in random_weights(6, 1))
     values = []
     for restarts in (4, 64, 2048):
@@ -418,11 +418,11 @@ def test_only_distributions_are_compared(function: Any, p: list[float], q: list[
 # --- A trained embedding ---
 
 CELLS = (np.arange(64) + 0.5) / 32 - 1
-"""Centres of 64 cells of [-1, 1]; no cell is heavy, so that the relaxed optimum is the true one but for very little."""
+"""Centres of 64 cells of [-1, 1]; no cell is heavy, so the relaxed optimum almost equals the true one."""
 
 
 def densities(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """The counter-example spread over a line, or two normal distributions."""
+    """The counter-example, spread over a line, or two normal distributions."""
     if name == "two levels":
         return np.where(CELLS < 0, 0.25, 0.75) / 32, np.where(CELLS < 0, 0.0, 1.0) / 32
     p, q = (np.exp(-0.5 * ((CELLS - centre) / 0.4) ** 2) for centre in (-0.2, 0.3))
@@ -431,7 +431,7 @@ def densities(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.partial(jax.jit, static_argnames="steps")
 def train_embedding(p: Array, q: Array, x: Array, *, steps: int) -> tuple[Array, Array]:
-    """An MLP onto the unit sphere by the linear loss (Eq. 7); the embedding of each row of `x`, and the losses."""
+    """Train an MLP to the unit sphere with the linear loss (Eq. 7); returns the embedding of each row of `x` and the losses."""
 
     def loss(net: MLP) -> Float[Array, ""]:
         phi = unit_sphere(net(x))
@@ -462,7 +462,7 @@ def test_a_trained_embedding_comes_close_to_the_exact_value_and_never_exceeds_it
 
 
 def test_the_linear_loss_is_the_contrastive_one_where_logits_are_nearly_equal() -> None:
-    """Eqs. 4 to 6 for cosines 0.8 and -0.6: log 2 + (-0.6 - 0.8) / 2 is near at temperature 100 and far off at 0.07."""
+    """Eqs. 4 to 6 for cosines 0.8 and -0.6: log 2 + (-0.6 - 0.8) / (2T) is close at temperature 100 and far off at 0.07."""
     anchor, positive, negative = np.array([[1.0, 0.0], [0.8, 0.6], [-0.6, 0.8]])
     slope = anchor @ (negative - positive) / 2
     assert slope == pytest.approx((np.sum((anchor - positive) ** 2) - np.sum((anchor - negative) ** 2)) / 4) == -0.7
@@ -517,7 +517,7 @@ def test_computed_figures_equal_their_formulas() -> None:
 
 
 def test_json_is_one_object_and_nothing_else_and_imports_no_jax(tmp_path: Path) -> None:
-    """The whole command, in a process of its own; no picture without being asked for one. The page of docs has its numbers."""
+    """The whole command, in a separate process; it draws no picture unless asked. docs/theory.md has its numbers."""
     code = "import sys; from pcil import cli; code = cli.main(sys.argv[1:]); assert 'jax' not in sys.modules; sys.exit(code)"
     command = [sys.executable, "-c", code, "theory", "--json"]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -535,7 +535,7 @@ def test_json_is_one_object_and_nothing_else_and_imports_no_jax(tmp_path: Path) 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small pairs only."""
+    """Use only small pairs."""
     monkeypatch.setattr(theory, "ATOMS", (2, 3))
 
 

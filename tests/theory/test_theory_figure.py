@@ -1,4 +1,4 @@
-"""The picture of Theorem 1 shows its numbers, nothing covers anything, and the same numbers make the same file."""
+"""The picture of Theorem 1 shows its numbers, without overlaps, and the same numbers give the same file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAIRS = [
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Figure]]:
-    """Every figure that is closed, kept for a look."""
+    """Every closed figure, kept for inspection."""
     kept: list[Figure] = []
     with monkeypatch.context() as patch:
         patch.setattr(plt, "close", kept.append)
@@ -46,7 +46,7 @@ def test_both_panels_show_their_numbers(tmp_path: Path, drawn: list[Figure]) -> 
         assert curve.get_ydata() == pytest.approx(bound(curve.get_xdata()))
         assert [*marked.get_xdata(), *marked.get_ydata()] == pytest.approx([0.25, star], abs=1e-9)
         assert f"{star:.2f}" in axes.texts[1].get_text()
-        assert axes.get_ylim()[0] < 0 and axes.get_ylim()[1] > 2, "all that is possible is in view"
+        assert axes.get_ylim()[0] < 0 and axes.get_ylim()[1] > 2, "all possible values are in view"
     assert len(right.collections[1].get_offsets()) == 1 and len(left.collections[1].get_offsets()) == 0
 
 
@@ -57,7 +57,7 @@ def test_no_words_cover_each_other_or_leave_the_page(tmp_path: Path, drawn: list
     texts = [text for axes in figure.axes for text in (*axes.texts, axes.title, axes.xaxis.label, axes.yaxis.label)]
     texts += [text for axes in figure.axes for text in axes.get_xticklabels()]
     labels = zip(figure.axes[0].get_yticks(), figure.axes[0].get_yticklabels(), strict=True)
-    texts += [text for height, text in labels if -0.1 < height < 2.15]  # there are ticks out of view
+    texts += [text for height, text in labels if -0.1 < height < 2.15]  # some ticks are out of view
     boxes = [text.get_window_extent() for text in (*texts, *figure.legends[0].get_texts()) if text.get_text()]
     assert len(boxes) > 20
     assert not [pair for pair in itertools.combinations(boxes, 2) if pair[0].overlaps(pair[1])]
@@ -67,7 +67,7 @@ def test_no_words_cover_each_other_or_leave_the_page(tmp_path: Path, drawn: list
 def test_good_and_bad_differ_in_shade_and_in_shape(tmp_path: Path, drawn: list[Figure]) -> None:
     draw(PAIRS, tmp_path)
     blue, vermilion = (np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) for colour in (HOLDS, FAILS))
-    assert abs(blue[0] - vermilion[0]) > 100, "those who see no green see red and blue"
+    assert abs(blue[0] - vermilion[0]) > 100, "the colours can be distinguished without green"
     fine, below, _ = drawn[0].axes[1].collections
     assert len(fine.get_paths()[0]) != len(below.get_paths()[0])
 

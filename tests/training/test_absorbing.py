@@ -1,7 +1,7 @@
-"""Survival bias, and that absorbing states remove it: an environment that ends early, and a reward that says nothing.
+"""Survival bias and its removal by absorbing states: an environment that may end early, and a constant reward.
 
-Kostrikov et al. 2019, section 4.2: where every step pays the same, an agent that counts an end as worth 0 clings to life (or
-flees it, if the pay is negative), whatever the demonstrations show.
+Kostrikov et al. 2019, section 4.2: if every step has the same reward, an agent to which an end has value 0 tries to survive (or
+to end the episode, if the reward is negative), whatever the demonstrations show.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EXIT = "pcil_test/exit-v0"
 
 
 class Exit(gymnasium.Env):
-    """Nothing ever changes, and an action above 0 ends the episode; it is cut after 20 steps."""
+    """Nothing ever changes, and an action above 0 ends the episode; it is truncated after 20 steps."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -52,7 +52,7 @@ class Exit(gymnasium.Env):
 
 @dataclass(frozen=True)
 class Constant(Reward):
-    """Every step pays the same: no demonstration of an early end, and none of survival."""
+    """Every step has the same reward, so the reward favours neither an early end nor survival."""
 
     needs_demos: ClassVar[bool] = False
     batch_size: int = 0
@@ -75,7 +75,7 @@ def _registered() -> Any:
 
 
 def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> state.State:
-    """Uniform actions throughout, so that both kinds of action are seen whatever the agent would like."""
+    """Train on uniform actions only, so that both kinds of action occur regardless of the agent's policy."""
     agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=n_step, absorbing=absorbing)
     changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
     run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=Constant(pay=pay))
@@ -90,7 +90,7 @@ def value(ended: state.State, action: float, absorbing: bool) -> float:
 
 @pytest.mark.parametrize("pay", [1.0, -1.0])
 def test_without_absorbing_states_an_end_is_worth_nothing(pay: float, tmp_path: Path) -> None:
-    """To stay is worth `pay / (1 - gamma)` if that is good, else one more step; to leave, one step's pay."""
+    """The value of staying is `pay / (1 - gamma)` if that is positive, else that of one more step; of leaving, one reward."""
     state = trained(pay, False, tmp_path / "run")
     stay = pay / (1 - GAMMA) if pay > 0 else pay + GAMMA * pay
     assert value(state, 0.9, False) == pytest.approx(pay, abs=0.3)
@@ -114,7 +114,7 @@ def test_the_policy_of_an_absorbing_run_takes_the_environments_own_observations(
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("steps", [1, 2, 5])
 def test_the_absorbing_state_is_the_first_of_one_window_as_every_other_state(n: int, steps: int) -> None:
-    """So its value is learned, which every target near an end builds on."""
+    """Its value is therefore learned, on which every target near an end depends."""
     obs = np.arange(1, steps + 2, dtype=np.float32)[:, None]
     episode = Episode(obs, np.zeros((steps, 1), np.float32), np.zeros(steps), terminated=True).absorbed(n)
     window = Replay.of([episode]).sample(np.random.default_rng(0), 1000, n)
@@ -127,18 +127,18 @@ def test_cloning_has_no_absorbing_states() -> None:
         BC(absorbing=True)
 
 
-# --- What a run decides by itself ---
+# --- The default ---
 
 
 def demos_of(task: str, folder: Path, ends: int = 0) -> str:
-    """Four demonstrations, of which so many are said to have ended early."""
+    """Four demonstrations, of which `ends` are marked as terminated."""
     source = Demonstrations.load(save_point_mass_demos(folder))
     episodes = [dataclasses.replace(e, terminated=i < ends) for i, e in enumerate(source.episodes)]
     return str(dataclasses.replace(source, task=task, episodes=tuple(episodes)).save(folder / f"ends-{ends}-v0"))
 
 
 class Told(Callback):
-    """Keeps what is said, and stops after the first episode."""
+    """Keeps the messages, and stops after the first episode."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
@@ -172,7 +172,7 @@ def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_
         runs.execute(run, tmp_path / "run", [told])
     assert told.said[0] == f"Absorbing state: {'on' if absorbing else 'off'}; {why}."
     assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["agent"]["absorbing"] is absorbing
-    with pytest.raises(loop.Stopped):  # the same command goes on
+    with pytest.raises(loop.Stopped):  # the same command resumes the run
         runs.execute(run, tmp_path / "run", [told])
     assert any("Resuming" in text for text in told.said)
 
@@ -188,7 +188,7 @@ def test_an_environment_that_does_not_say_so_is_taken_to_end_early_and_the_ten_t
 def test_an_early_end_has_as_many_absorbing_steps_as_it_had_steps_before(
     steps: int, terminated: bool, n_step: int, rows: int
 ) -> None:
-    """Else the end of a short demonstration would weigh less than any other state that all demonstrations reach."""
+    """Otherwise the end of a short demonstration would have less weight than other states."""
     episode = Episode(np.zeros((steps + 1, 1), np.float32), np.zeros((steps, 1), np.float32), np.zeros(steps), terminated)
     run = changed(small_run("expert"), {"agent.absorbing": True, "agent.n_step": n_step})
     assert len(state.absorbed(run, episode)) == rows

@@ -1,4 +1,4 @@
-"""Laws of checkpoints: what is restored is what was saved, or the checkpoint before it, and never anything else."""
+"""Checkpoints: the restored state is the saved one, or that of the previous checkpoint, and nothing else."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pcil.training import checkpoint
 
 
 class Learned(eqx.Module):
-    """A stand-in for a learner: networks, opt_state, key data, a counter on the device, and settings that are no arrays."""
+    """A stand-in for a learner: networks, optimiser state, key data, a counter on the device, and settings that are not arrays."""
 
     network: MLP
     opt_state: dict[str, Any]
@@ -68,7 +68,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(two: Path, tmp_path: Path) -> Path:
-    """A copy of the two checkpoints that may be damaged."""
+    """A copy of the two checkpoints that a test may damage."""
     return Path(shutil.copytree(two, tmp_path / "checkpoint"))
 
 
@@ -101,7 +101,7 @@ def test_a_tree_comes_back_leaf_by_leaf_and_keeps_what_is_no_array(folder: Path)
     for a, b in zip(leaves, expected, strict=True):
         assert isinstance(a, jax.Array) and a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
-    assert (restored.rate, restored.name) == (1.5, "name 3")  # settings are the run's, not the checkpoint's
+    assert (restored.rate, restored.name) == (1.5, "name 3")  # settings come from the run, not from the checkpoint
     draw = jax.random.normal(jax.random.wrap_key_data(restored.root))
     assert float(draw) == float(jax.random.normal(jax.random.key(20)))
 
@@ -159,7 +159,7 @@ def test_where_there_is_none_nothing_is_restored(tmp_path: Path) -> None:
 
 
 def written_by_orbax(folder: Path, arrays: dict[str, np.ndarray], counters: dict[str, Any]) -> None:
-    """A checkpoint as they were before version 0.2."""
+    """A checkpoint in the format before version 0.2."""
     ocp = pytest.importorskip("orbax.checkpoint")
     ocp.PyTreeCheckpointer().save((folder / "arrays").absolute(), arrays)
     files = {str(p.relative_to(folder / "arrays")): zlib.crc32(p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
@@ -191,7 +191,7 @@ def test_without_orbax_its_checkpoints_are_refused_with_what_to_install(folder: 
 
 @pytest.mark.parametrize("name", ["meta.json", "arrays.safetensors"])
 def test_every_flipped_bit_is_noticed(folder: Path, name: str) -> None:
-    """At 60 places of the file; the last byte of meta.json is a line break that says nothing."""
+    """At 60 places of the file, except the last byte of meta.json, an irrelevant line break."""
     file = folder / "20" / name
     whole = file.read_bytes()
     for at in np.linspace(0, len(whole) - 2, 60).astype(int):
@@ -205,7 +205,7 @@ def test_every_flipped_bit_is_noticed(folder: Path, name: str) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="this system has no limit on the size of a file")
 def test_a_limit_on_the_size_of_files_is_an_error_of_the_system(folder: Path) -> None:
-    """As a full disk is; the library that writes has an error of its own for it."""
+    """As with a full disk, although the library that writes raises its own error."""
     import resource
 
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -273,7 +273,7 @@ def test_where_all_are_damaged_there_is_a_sentence_for_each_and_no_state(folder:
 
 @pytest.mark.parametrize("frames", [5, 15, 25])
 def test_after_damage_the_next_save_is_the_one_restored(folder: Path, frames: int) -> None:
-    """A run that fell back, or began again, is behind the damaged ones; they must not push its own checkpoints out."""
+    """A run that resumed earlier, or started again, has fewer frames than the damaged ones, which must not displace its own."""
     for name in ("10", "20"):
         (folder / name / "meta.json").unlink()
     checkpoint.save(folder, frames, make_arrays(frames), {"frames": frames})
@@ -282,7 +282,7 @@ def test_after_damage_the_next_save_is_the_one_restored(folder: Path, frames: in
     assert same(arrays, make_arrays(frames)) and counters == {"frames": frames}
 
 
-# --- Being killed ---
+# --- Killed processes ---
 
 
 def test_what_a_killed_save_left_is_ignored_and_the_next_save_removes_it(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Settings: every preset makes a run, the paper's numbers are the paper's, and what can't work is refused."""
+"""Settings: every preset makes a run, the paper preset has the paper's numbers, and invalid settings are refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class WholeEpisodes(TaskReward):
 
 
 def to_json(run: Run) -> dict[str, Any]:
-    """The settings as `run.json` gives them back."""
+    """The settings after a round trip through JSON, as in `run.json`."""
     return json.loads(json.dumps(run.to_json()))
 
 
@@ -62,7 +62,7 @@ def test_a_preset_makes_a_run_that_survives_json(method: str, preset: str) -> No
 
 @pytest.mark.parametrize(("method", "preset"), EVERY_RUN)
 def test_equal_settings_share_one_compilation(method: str, preset: str) -> None:
-    """What is compiled is found by its hash; seed, frames and task's name are no part of it."""
+    """The compiled function is found by a hash that does not depend on seed, frames and the task's name."""
     one, two = presets.make("cheetah_run", method, preset), presets.make("hopper_hop", method, preset, seed=7)
     assert one.learner == two.learner and hash(one.learner) == hash(two.learner)
     wider = dataclasses.replace(one, agent=dataclasses.replace(one.agent, hidden=512))
@@ -71,7 +71,7 @@ def test_equal_settings_share_one_compilation(method: str, preset: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_paper_preset_is_the_papers_table(task: str) -> None:
-    """Appendix B, table of hyperparameters (paper.tex, label table:hyper); the penalty is the authors' agent/pcil.py."""
+    """Appendix B, table of hyperparameters (paper.tex, label table:hyper); the penalty is from the authors' agent/pcil.py."""
     run = presets.make(task, "pcil", "paper")
     assert isinstance(run.agent, DrQV2)
     assert run.replay_steps == 500_000
@@ -80,13 +80,13 @@ def test_the_paper_preset_is_the_papers_table(task: str) -> None:
     assert run.agent.tau == 0.01
     assert run.agent.batch_size == 128
     assert run.agent.hidden == run.reward.hidden == 256
-    assert run.reward.batch_size == 256 * 0.5, "discriminator batch of 256, half of it expert data"
+    assert run.reward.batch_size == 256 * 0.5, "discriminator batch of 256, half of which is expert data"
     assert run.reward.temperature == 0.07
     assert run.reward.penalty == 10
 
 
 def test_the_released_preset_never_applies_the_temperature_and_stores_rewards() -> None:
-    """Authors' agent/pcil.py and train.py."""
+    """As in the authors' agent/pcil.py and train.py."""
     run = presets.make("walker_walk", "pcil", "released")
     assert run.reward.temperature == 1 and run.label == "stored"
     assert run.agent.hidden == run.reward.hidden == 1024 and run.agent.batch_size == 512
@@ -101,7 +101,7 @@ def test_presets_can_be_changed_in_any_field() -> None:
 def test_nested_settings_change_by_dotted_names() -> None:
     run = presets.make("walker_walk", **{"agent.noise.steps": 7, "agent.gamma": 0.9, "reward.penalty": 0.0, "seed": 3})
     assert (run.agent.noise.steps, run.agent.gamma, run.reward.penalty, run.seed) == (7, 0.9, 0.0, 3)
-    assert (run.agent.noise.start, run.agent.tau) == (1.0, 0.01), "what is not named stays"
+    assert (run.agent.noise.start, run.agent.tau) == (1.0, 0.01), "other settings are unchanged"
 
 
 @pytest.mark.parametrize("name", ["speed", "agent.speed", "agent.noise.speed", "seed.speed"])
@@ -143,7 +143,7 @@ def test_fields_that_one_side_lacks_are_differences() -> None:
 
 
 def test_a_setting_that_an_older_run_lacks_had_its_classes_default() -> None:
-    """So a run of an older version goes on, and only a value that changes what it did is a difference."""
+    """A run of an older version can thus be resumed, and only a value other than its default is a difference."""
     run = dataclasses.replace(presets.make("walker_walk"), clip_actions=True)
     older = to_json(run)
     del older["agent"]["noise_correlation"], older["agent"]["normalize_observations"], older["agent"]["noise"]["end"]
@@ -164,7 +164,7 @@ def test_from_json_gives_back_the_run_that_was_written(method: str, preset: str)
 
 
 def test_a_class_that_a_file_names_is_made_only_where_it_is_given() -> None:
-    """Also where it can't be made without one of its settings."""
+    """Even if it can't be made without one of its settings."""
     run = dataclasses.replace(presets.make("walker_walk", "expert"), reward=Needy(weight=3.0, task_weight=2.0))
     path = f"{Needy.__module__}:Needy"
     with pytest.raises(InputError, match=f"The reward '{path}' is not part of this package"):
@@ -256,7 +256,7 @@ def test_nested_settings_are_reached_by_dotted_names() -> None:
 
 
 def test_what_is_given_whole_keeps_its_settings_under_every_preset() -> None:
-    """A preset changes single settings of its own agent and reward, never of one that was given."""
+    """A preset changes settings of its own agent and reward, never of a given one."""
     assert presets.make("walker_walk", preset="released", reward=PCIL(batch_size=64)).reward == PCIL(batch_size=64)
     agent = DrQV2(batch_size=512)
     assert presets.make("walker_walk", "pwil", "released", agent=agent).agent == agent
@@ -305,7 +305,7 @@ def test_numpys_numbers_are_numbers() -> None:
 
 
 def test_no_third_word_is_taken_in_python_either() -> None:
-    """It would fit neither of the two that the loop asks for; in a process of its own, where no test watches over types."""
+    """The loop compares with each of the two. Runs in a separate process, without the type checks of the tests."""
     code = "from pcil.training import presets; presets.make('walker_walk', label='store')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "InputError: Run.label is 'store'; it must be one of 'sampled', 'stored'" in done.stderr
@@ -323,7 +323,7 @@ def test_no_third_word_is_taken_in_python_either() -> None:
 def test_released_has_the_batch_of_bc_and_the_length_of_an_expert_by_task(
     task: str, batch: int, frames: int, steps: int
 ) -> None:
-    """BC's batch is the agent's by bz_ratio = 2; experts are DrQ-v2's, whose tasks are easy or medium."""
+    """BC's batch is half the agent's (bz_ratio = 2); experts have DrQ-v2's settings for easy or medium tasks."""
     cloned, agent = presets.make(task, "bc", "released").agent, presets.make(task, "pcil", "released").agent
     assert cloned.batch_size == batch == agent.batch_size // 2 and cloned.hidden == agent.hidden == 1024
     expert = presets.make(task, "expert", "released")
@@ -334,7 +334,7 @@ def test_released_has_the_batch_of_bc_and_the_length_of_an_expert_by_task(
 
 
 def test_classes_go_by_their_names_in_the_registry_and_paths_of_older_files_are_known() -> None:
-    """Wherever a class of ours lay when the file was written; a person's own class goes by its path."""
+    """Even if a built-in class was in another module when the file was written; a user's class is named by its path."""
     for method in presets.METHODS:
         settings = presets.make("walker_walk", method).to_json()
         assert AGENTS[settings["agent"]["class"]] and REWARDS[settings["reward"]["class"]]

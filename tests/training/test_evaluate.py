@@ -1,4 +1,4 @@
-"""Laws of evaluation: episodes in lockstep are the episodes one by one, and each starts from a seed of its own."""
+"""Evaluation: episodes in lockstep equal episodes played one by one, and each starts from its own seed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pcil.training.evaluate import LOCKSTEP, Evaluation, environments_for, evalu
 
 
 class Walk(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A random walk of `length` steps pushed by the action; its noise comes from the seed of the reset."""
+    """A random walk of `length` steps, moved by the action; its noise depends on the seed of the reset."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -53,7 +53,7 @@ def one_by_one(environments: list[Walk], seed: int) -> tuple[list[float], list[i
         total, length, over = 0.0, 0, False
         while not over:
             obs, reward, terminated, truncated, _ = env.step(policy(obs))
-            total += reward  # one after the other: `sum` corrects its rounding errors from Python 3.12 on
+            total += reward  # in order: since Python 3.12, `sum` corrects rounding errors
             length += 1
             over = terminated or truncated
         returns.append(total)
@@ -77,7 +77,7 @@ def test_in_lockstep_as_one_by_one(lengths: tuple[int, ...]) -> None:
 
 
 def test_an_episode_keeps_its_row_of_the_block_until_all_are_over() -> None:
-    """A matrix product of fewer rows may differ in the last bit."""
+    """A matrix product with fewer rows may differ in the last bit."""
     asked = []
 
     def act(obs: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def test_an_episode_keeps_its_row_of_the_block_until_all_are_over() -> None:
         return policy(obs)
 
     evaluate(act, walks(3, 1, 4), seed=0)
-    assert asked == [[3, 1, 4], [2, 0, 3], [1, 0, 2], [0, 0, 1]]  # the steps that each episode has left
+    assert asked == [[3, 1, 4], [2, 0, 3], [1, 0, 2], [0, 0, 1]]  # the remaining steps of each episode
     asked.clear()
     evaluate(act, walks(2), seed=0, episodes=3)
     assert asked == [[2, 0, 0], [1, 0, 0], [0, 2, 0], [0, 1, 0], [0, 0, 2], [0, 0, 1]]
@@ -112,7 +112,7 @@ def test_a_policy_that_returns_too_few_actions_is_noticed() -> None:
 
 
 class Reporting(Walk):
-    """Says at each step how far it is, whether that is success, and something in words."""
+    """Reports at each step its distance, whether it succeeded, and a text."""
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         obs, reward, terminated, truncated, _ = super().step(action)
@@ -130,7 +130,7 @@ def test_the_numbers_of_each_episodes_last_info_are_kept() -> None:
         "only at the end": [1, 1, 1],
     }
     assert result.success == [float(end > 0) for end in ends] and 0 < sum(result.success) < 3
-    assert evaluate(policy, [*environments, Walk(2)], seed=3).info == {}, "what one of them does not say is left out"
+    assert evaluate(policy, [*environments, Walk(2)], seed=3).info == {}, "a key that is missing in one of them is left out"
     assert evaluate(policy, walks(2), seed=3).success is None
 
 
@@ -151,7 +151,7 @@ def test_fewer_environments_than_episodes_take_them_in_turns() -> None:
 
 def test_an_environment_may_reuse_its_buffer() -> None:
     class Reusing(Walk):
-        """Hands out one array again and again."""
+        """Returns the same array at every step."""
 
         buffer = np.zeros(2, np.float32)
 

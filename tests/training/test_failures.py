@@ -1,4 +1,4 @@
-"""Runs that fail: what they leave, what they say, and that the same command goes on; and which environments are open."""
+"""Runs that fail: their files, their messages, and resuming them; and the closing of environments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NAN = float("nan")
 
 
 class Flaky(Odd):
-    """Wrong only while `broken`."""
+    """Has its mistake only while `broken`."""
 
     broken = True
 
@@ -55,7 +55,7 @@ def register(**wrong: Any) -> None:
 
 
 def odd_run(method: str = "expert", **changes: Any) -> Run:
-    """Episodes of ten steps; updates from the third one on."""
+    """Episodes of ten steps; updates start in the third one."""
     settings = {"frames": 60, "seed_frames": 20, "random_frames": 20, "evaluate_every": 30}
     return small_run(method, ID, **{**settings, **changes})
 
@@ -97,7 +97,7 @@ def test_a_failure_in_mid_episode_keeps_the_episodes_before_and_the_same_command
 
 
 def test_a_failure_in_an_evaluation_loses_nothing_either(tmp_path: Path) -> None:
-    """Of the two copies for evaluation the first plays its second episode at frame 30."""
+    """The first of the two copies for evaluation plays its second episode at frame 30."""
     register(step=raising(OSError("the port is gone")), episode=2)
     with pytest.raises(RunError, match=r"OSError \(the port is gone\), in step 3 of training episode 2"):
         runs.execute(odd_run(), tmp_path / "training")
@@ -136,7 +136,7 @@ def test_the_command_line_says_one_sentence_and_exits_with_1(capsys: pytest.Capt
 
 
 def updated(reward: list[float], label: str = "stored", obs: list[float] | None = None, **agent: Any) -> learner.Learner:
-    """A learner after one update on windows of each of these rewards, or of observations times a factor."""
+    """A learner after one update for each of these rewards, or for each factor of the observations."""
     run = small_run("pcil", label=label)
     run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, **agent))
     n = run.agent.n_step
@@ -167,7 +167,7 @@ def test_parameters_are_named_where_every_loss_was_finite() -> None:
 
 
 def no_value_is_missing(folder: Path) -> None:
-    """In none of the files of a run is there anything that is not finite."""
+    """Check that no file of a run contains a value that is not finite."""
     assert all(np.isfinite(array).all() for array in arrays(folder).values())
     text = (folder / "eval.csv").read_text() + (folder / "train.jsonl").read_text()
     assert not any(word in text for word in ("nan", "NaN", "inf", "Infinity")) and not (folder / "DONE").exists()
@@ -177,7 +177,7 @@ def no_value_is_missing(folder: Path) -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("offline", [False, True])
 def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(offline: bool, tmp_path: Path) -> None:
-    """Rewards of 1e38, whose squares float32 can't hold; and, offline, deviations that make the loss infinite."""
+    """Rewards of 1e38, whose squares overflow in float32; offline, deviations that make the loss infinite."""
     register(episode=4, reward=1e38)
     run = odd_run("bc" if offline else "expert", frames=200, update_every=1)
     if offline:
@@ -195,7 +195,7 @@ def test_a_run_that_diverges_ends_with_one_sentence_and_keeps_what_was_whole(off
 def test_where_an_action_is_not_finite_the_parameters_that_went_first_are_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """An update that makes them NaN without a loss that is."""
+    """An update makes the parameters NaN although its losses are finite."""
     register()
     update = DrQV2.update
 
@@ -206,7 +206,7 @@ def test_where_an_action_is_not_finite_the_parameters_that_went_first_are_named(
 
     monkeypatch.setattr(DrQV2, "update", broken)
     run = odd_run(update_every=1)
-    run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, tau=0.0123))  # compiled for this test alone
+    run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, tau=0.0123))  # compiled only for this test
     with pytest.raises(RunError, match=r"the actor's parameters became .* in update 8, after frame 20;") as error:
         runs.execute(run, tmp_path)
     assert "an action whose entry 0 is nan, in step 9 of training episode 3" in str(error.value.__context__)
@@ -254,7 +254,7 @@ def test_a_single_environment_changes_no_result(monkeypatch: pytest.MonkeyPatch,
     single = odd_run(evaluate_episodes=5, single_environment=True)
     finish(single, tmp_path / "single", stops=(3,))
     same_run(tmp_path / "many", tmp_path / "single")
-    runs.execute(odd_run(evaluate_episodes=5), tmp_path / "single")  # a setting of the machine
+    runs.execute(odd_run(evaluate_episodes=5), tmp_path / "single")  # single_environment is a machine setting
 
 
 def test_evaluation_in_a_single_environment_gives_the_same_numbers(
@@ -285,7 +285,7 @@ def test_a_function_or_an_environment_is_trained_in_and_named_in_run_json(tmp_pa
     result = pcil.train(make_env, out=tmp_path / "function", **SMALL)
     mine = make_env()
     pcil.train(mine, out=tmp_path / "object", **SMALL)
-    assert [mine.unwrapped] == Odd.open_copies, "it is its owner's to close"
+    assert [mine.unwrapped] == Odd.open_copies, "its owner closes it"
     mine.close()
     assert np.isfinite(result.final_return) and rows(tmp_path / "function") == rows(tmp_path / "object")
     names = [json.loads((tmp_path / name / "run.json").read_text())["run"]["task"] for name in ("function", "object")]
@@ -366,7 +366,7 @@ def test_settings_of_another_kind_are_shown_shortened(field: str, value: Any, sa
 
 
 class CtrlC(Callback):
-    """Presses it at the end of the second episode."""
+    """Presses Ctrl-C at the end of the second episode."""
 
     episodes = 0
 
@@ -389,7 +389,7 @@ def test_ctrl_c_in_python_saves_the_run_and_raises(tmp_path: Path) -> None:
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path: Path) -> None:
     class Twice(CtrlC):
-        """Presses it again at once."""
+        """Presses Ctrl-C again at once."""
 
         def episode(self, row: dict[str, Any]) -> None:
             super().episode(row)

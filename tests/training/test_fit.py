@@ -1,4 +1,4 @@
-"""Laws of what fits a run: boxes, arguments and time step of the environment, clipped actions, and parts that are absent."""
+"""Which demonstrations fit a run: boxes, arguments and time step of the environment, clipped actions, and missing data."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from small import POINT_MASS, save_point_mass_demos, small_run
 
 
 class Slider(gymnasium.Env):
-    """A point that is pushed by `skip` times the action, in units of its bound; eight steps."""
+    """A point that is moved by `skip` times the action, in units of its bound; eight steps."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  as gymnasium.Env declares it
 
@@ -55,7 +55,7 @@ class Slider(gymnasium.Env):
 
 @pytest.fixture(autouse=True)
 def sliders() -> Iterator[None]:
-    """The plain one, and two whose registration has arguments of its own."""
+    """Register the plain environment, and two with arguments in their registration."""
     ids = {"test/slider-v0": {}, "test/wide-v0": {"bound": 10.0}, "test/other-v0": {"what": "other"}}
     for name, kwargs in ids.items():
         gymnasium.register(name, "test_fit:Slider", kwargs=kwargs, max_episode_steps=8)
@@ -65,21 +65,21 @@ def sliders() -> Iterator[None]:
 
 
 def save(folder: Path, task: str = "test/slider-v0", *, by_us: bool = False, **kwargs: Any) -> str:
-    """Three episodes of pushes of 0.7 times the bound, recorded in Gymnasium's environment or in ours."""
+    """Save three episodes with actions of 0.7 times the bound, recorded in Gymnasium's environment or in ours."""
     env = envs.make(task, env_kwargs=kwargs) if by_us else gymnasium.make(task, **kwargs)
     push = np.full(2, 0.7 * env.action_space.high[0], np.float32)
     return str(demos.record(lambda obs: push, env, 3, task=task, seed=0, info={}).save(folder / "demos"))
 
 
 def fit(folder: str, task: str = "test/slider-v0", method: str = "pcil", **changes: Any) -> tuple[Demonstrations, list[str]]:
-    """The demonstrations as a run has them, and what it is told."""
+    """The demonstrations as a run uses them, and the messages."""
     said: list[str] = []
     _, found, _ = runs.prepared(presets.make(task, method, demos=folder, **changes), said.append)
     assert found is not None
     return found, said
 
 
-# --- Another environment ---
+# --- Demonstrations from another environment ---
 
 
 @pytest.mark.parametrize("by_us", [False, True])
@@ -107,7 +107,7 @@ def test_another_action_box_is_refused_until_it_is_said_which_holds(
 def test_kept_actions_have_the_value_that_was_recorded(
     theirs: tuple[float, float], ours: tuple[float, float], unit: float
 ) -> None:
-    """Boxes are (middle, half the width)."""
+    """Boxes are given as (middle, half the width)."""
     origin, here = (Origin(action_low=[m - h], action_high=[m + h]) for m, h in (theirs, ours))
     episode = Episode(np.zeros((2, 1), np.float32), np.full((1, 1), unit, np.float32), np.zeros(1))
     (kept,) = pcil.training.fit._kept(Demonstrations("x", (episode,), {}, origin), here).episodes
@@ -184,7 +184,7 @@ def test_a_recording_keeps_its_environment_through_saving(tmp_path: Path) -> Non
 
 
 def test_a_recorded_action_is_measured_in_the_bounds_of_its_environment(tmp_path: Path) -> None:
-    """As played: the environment was pushed by 7 of 10, whichever way it was made."""
+    """As played: the action in the environment was 7 of 10, however the environment was made."""
     ours, raw = (Demonstrations.load(save(tmp_path / str(k), "test/wide-v0", by_us=k == 1)) for k in range(2))
     np.testing.assert_allclose(ours.action, 0.7, rtol=1e-6)
     assert ours.hash == raw.hash
@@ -194,7 +194,7 @@ def test_a_recorded_action_is_measured_in_the_bounds_of_its_environment(tmp_path
 
 
 def loud(folder: Path) -> str:
-    """The third of 48 entries is out of bounds by 2%."""
+    """Demonstrations in which the third of 48 entries is out of bounds by 2%."""
     path = Path(save(folder))
     with h5py.File(path / "data" / "main_data.hdf5", "a") as file:
         file["episode_0/actions"][1, 0] = -1.02
@@ -213,11 +213,11 @@ def test_actions_out_of_bounds_are_refused_with_the_option_that_clips_them(tmp_p
     assert fit(save(tmp_path / "quiet"), clip_actions=True)[1] == []
 
 
-# --- Absent actions or rewards ---
+# --- Missing actions or rewards ---
 
 
 def stripped(folder: Path, *absent: str, how: str = "from_arrays") -> str:
-    """The point mass's demonstrations without some parts, in one of the ways in which a dataset may lack them."""
+    """The point mass's demonstrations without some parts, which can be missing in different ways."""
     whole = Demonstrations.load(save_point_mass_demos(folder / "whole"))
     if how == "from_arrays":
         parts = {
@@ -301,7 +301,7 @@ def test_a_replay_that_begins_with_demonstrations_reads_them_whole(tmp_path: Pat
 
 
 def test_pcil_on_states_alone_is_bit_for_bit_pcil_on_whole_demonstrations(tmp_path: Path) -> None:
-    """Actions and rewards of the demonstrations are nowhere in it."""
+    """The actions and rewards of the demonstrations have no influence."""
     states, whole = stripped(tmp_path / "data", "actions", "rewards"), tmp_path / "data" / "whole" / "point_mass-v0"
     for name, folder in (("states", states), ("whole", str(whole))):
         result = runs.execute(small_run(demos=folder), tmp_path / name)
@@ -366,7 +366,7 @@ def test_arrays_that_do_not_fit_are_refused(call: Callable[[], object], expected
 
 
 def _with_capital(call: Callable[[], object]) -> None:
-    """A sentence that begins with the name of an argument is one all the same."""
+    """Allow a message that begins with the name of an argument."""
     try:
         call()
     except InputError as error:
@@ -420,7 +420,7 @@ def test_arguments_survive_json() -> None:
     assert run == dataclasses.replace(run, env_kwargs=run.to_json()["env_kwargs"]) and isinstance(run, Run)
     assert run.env_kwargs == {"a": [1, 2], "b": {"c": None}}
     plain = presets.make("walker_walk")
-    assert len({run, plain, presets.make("walker_walk")}) == 2, "a run can be hashed, and its arguments tell it apart"
+    assert len({run, plain, presets.make("walker_walk")}) == 2, "a run can be hashed, and its arguments are part of the hash"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
-"""Numbers of five updates of every method stay what they were, and every preset's settings go through an update.
+"""The numbers of five updates of every method are unchanged, and an update runs with every preset's settings.
 
-`make_golden.py` makes `golden.json`; it is what to run after a change that is meant to change numbers.
+Run `make_golden.py` to update `golden.json` after a change that is meant to change numbers.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from small import random_batch, windows
 GOLDEN = json.loads(make_golden.GOLDEN.read_text())
 CASES = make_golden.cases()
 TOLERANCE = 1e-4
-"""Relative. Another processor or release of XLA adds in another order, which changes the last bits. With every first weight
-moved by its last bit the numbers moved by at most 2.5e-6."""
+"""Relative. Another processor or release of XLA adds in another order, which changes the last bits. When every initial weight
+was changed in its last bit, the numbers changed by at most 2.5e-6."""
 NEARLY_TIED = 0.03
-"""Share of the pairs of an update whose two scores differ by rounding alone, so that an accuracy may count them either way. It
-was 0.025 where XLA was told to leave out most optimisations (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as `mutants.py` does)."""
+"""The fraction of pairs in an update whose scores differ only by rounding, so that an accuracy may count them either way. It
+was 0.025 with most optimisations of XLA disabled (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as in `mutants.py`)."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:
@@ -38,7 +38,7 @@ def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from
 
 @pytest.mark.parametrize("name", CASES)
 def test_five_updates_give_the_numbers_that_they_gave(name: str) -> None:
-    """A part's second sum has terms of both signs, so its tolerance is that of the first, the sum of their sizes."""
+    """A part's second sum has terms of both signs, so its tolerance is relative to the first, the sum of their sizes."""
     got, expected = make_golden.five_updates(CASES[name]), GOLDEN["cases"][name]
     assert got["metrics"].keys() == expected["metrics"].keys()
     for part, value in got["metrics"].items():
@@ -60,21 +60,21 @@ def test_defaults_stay_what_old_run_folders_mean_by_them() -> None:
 # --- Whole presets ---
 
 SPEC = Spec(24, 6, 2)
-"""As walker_walk's."""
+"""The sizes of walker_walk."""
 PRESETS = {(method, preset): presets.make("walker_walk", method, preset) for method, preset in presets.METHOD_SETTINGS}
 DIFFERENT: dict[Algorithm, str] = {run.learner: " ".join(names) for names, run in PRESETS.items()}
-"""Runs that differ in what is compiled; three presets of the expert's reward with two agents are two, for example."""
+"""Runs whose compiled functions differ; three presets of the expert with two different agents count as two, for example."""
 
 
 def given(run: Run) -> tuple[list[Batch], Window, Window | None, Window | None]:
-    """Demonstrations and draws of the sizes that the settings ask for."""
+    """Demonstrations and windows of the sizes that the settings require."""
     rows, span, n = run.reward.batch_size, run.reward.span, run.agent.n_step
     draw = lambda number, steps: windows(random_batch(number + steps, 24, 6), steps)  # noqa: E731
     return [random_batch(300, 24, 6)], draw(run.agent.batch_size, n), draw(rows, span) if rows else None, None
 
 
 def updated(run: Run, by: Any = None) -> Any:
-    """Metrics' sums after one update, or what `by` (`jax.eval_shape`) makes of it."""
+    """The sums of metrics after one update, or the result of `by` (`jax.eval_shape`) for the update."""
     demos, *draws = given(run)
 
     def one() -> Any:
@@ -90,7 +90,7 @@ def run_of(method: Algorithm) -> Run:
 
 @pytest.mark.parametrize("method", DIFFERENT, ids=DIFFERENT.get)
 def test_every_preset_of_every_method_can_be_traced(method: Algorithm) -> None:
-    """Shapes and types alone, so nothing is compiled."""
+    """Only shapes and types are computed, so nothing is compiled."""
     totals = updated(run_of(method), jax.eval_shape)
     assert {"updates"} < set(totals) and all(
         (total.shape == () or name == "finite") and total.dtype == np.float32 for name, total in totals.items()

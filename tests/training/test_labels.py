@@ -1,4 +1,4 @@
-"""Labels of whole episodes, and what a learner says of values that are not finite, by hand."""
+"""Labels of whole episodes, and the reports of values that are not finite, by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from small import random_batch
 
 @dataclass(frozen=True)
 class Listener(Reward):
-    """Of whole episodes: takes note of rows, sums and a draw at an episode's end, and pays each step for its rows and note."""
+    """A reward of whole episodes: notes rows, sums and a random draw at the end; a step's reward is made of its row and the note."""
 
     scope: ClassVar[Literal["step", "episode"]] = "episode"
     padded: bool = False
@@ -53,7 +53,7 @@ class Listener(Reward):
 
 
 def episode(steps: int) -> Episode:
-    """With observation `t` in step `t` and reward `100 t`."""
+    """An episode with observation `t` in step `t` and reward `100 t`."""
     obs = np.stack([np.arange(steps + 1), np.zeros(steps + 1)], axis=1).astype(np.float32)
     return Episode(obs, np.full((steps, 2), 0.25, np.float32), 100.0 * np.arange(steps))
 
@@ -76,7 +76,7 @@ STEPWISE = Recorder()
     ids=str,
 )
 def test_an_episode_is_lengthened_where_that_makes_no_difference(reward: Reward, steps: int, rows: int) -> None:
-    """With its last state, actions that are NaN and rewards of 0."""
+    """It is padded with its last state, NaN actions and rewards of 0."""
     given = episode(steps)
     obs, action, paid = learner._padded(started(reward)[0], given)
     assert obs.shape == (rows + 1, 2) and action.shape == (rows, 2) and paid.shape == (rows,)
@@ -105,7 +105,7 @@ def test_a_reward_takes_note_of_an_episode_before_it_is_labelled_with_the_same_r
     assert after.reward["sum"] == 1 + 2 + 3 + 4 + 5, "the states that the steps led to"
     assert after.agent is state.agent and after.root is state.root and after.totals is state.totals
     assert learner.label_episode(method, after, episode(5), 7).tolist() == [16, 17, 18, 19, 20]
-    assert (learner.label_episode(method, after, episode(5), 8) == -1).all(), "another episode has another key"
+    assert (learner.label_episode(method, after, episode(5), 8) == -1).all(), "each episode has its own key"
 
 
 def test_a_reward_that_takes_no_note_leaves_the_learner_as_it_is() -> None:
@@ -113,12 +113,12 @@ def test_a_reward_that_takes_no_note_leaves_the_learner_as_it_is() -> None:
     assert learner.close_episode(method, state, episode(5), 0) is state
 
 
-# --- Beginnings ---
+# --- The first state ---
 
 
 @dataclass(frozen=True)
 class Watcher(Scribe):
-    """Notes the rows of which it is told, and has a trunk of its own for each of the two."""
+    """Records the rows that it observes, and has separate trunks for critic and actor."""
 
     def init(self, spec: Spec, *, key: Any) -> dict[str, Any]:
         return super().init(spec, key=key) | {"told": jnp.float32(0), "rows": jnp.int32(0)}
@@ -169,7 +169,7 @@ def test_a_learner_begins_with_keys_of_its_seed_and_with_zeros_for_each_metric()
     assert state.totals["finite"].tolist() == [0] * 5 and all(not np.any(total) for total in state.totals.values())
 
 
-# --- What is not finite ---
+# --- Values that are not finite ---
 
 
 def test_checks_are_in_the_order_of_an_update() -> None:
@@ -211,7 +211,7 @@ def counted(updates: int, finite: list[int], agent: Any = 1.0) -> Learner:
     ],
 )
 def test_what_was_first_is_named_and_losses_of_one_part_together(finite: list[int], found: Any) -> None:
-    """Features that are not finite are the work of the update before."""
+    """Features that are not finite were caused by the previous update."""
     assert learner.first_not_finite(counted(5, finite)) == found
 
 
@@ -222,7 +222,7 @@ def test_parameters_are_named_where_nothing_else_was_wrong() -> None:
 
 
 def test_the_updates_before_the_first_that_was_not_finite_are_counted() -> None:
-    """Whatever comes after it, finite or not, counts no more."""
+    """Later updates do not count, finite or not."""
     method, state = started(Recorder(batch_size=3), "stored")
     window, expert = learner._zeros(SPEC, 6, 1), learner._zeros(SPEC, 3, 1)
     rewards = [0.0, 1.0, np.nan, 0.0, np.inf]

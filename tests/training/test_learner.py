@@ -1,6 +1,6 @@
-"""The order of a step and the schedules of a run, by an agent and a reward that learn nothing and write down what they see.
+"""The order of a step and the schedules of a run, tested with an agent and a reward that only record their inputs.
 
-`Recorder` is a reward and `Scribe` an agent. The state of each counts its updates, so whatever was computed from a state says
+`Recorder` is a reward and `Scribe` an agent. The state of each counts its updates, so every value computed from a state shows
 how old that state was.
 """
 
@@ -46,7 +46,7 @@ def draw(key: Any) -> jnp.ndarray:
 
 @dataclass(frozen=True)
 class Recorder(Reward):
-    """Labels each step with the updates of its own state, those of the features, or a draw, in turn."""
+    """Labels each step with the updates of its own state, those of the features, or a random draw, in turn."""
 
     batch_size: int = 3
 
@@ -65,13 +65,13 @@ class Recorder(Reward):
 
 @dataclass(frozen=True)
 class Scribe(Agent):
-    """Its networks' weights are the number of its updates; exploring draws `greed` numbers a step."""
+    """All weights of its networks equal the number of its updates; exploration draws `greed` numbers in each step."""
 
     batch_size: int = 6
     n_step: int = 1
     greed: int = 2
     acts: ClassVar[list[tuple[int, float, tuple[float, ...]]]] = []
-    """Agent steps so far, updates of the actor, and draws, of each action that was asked for."""
+    """Agent steps so far, updates of the actor, and random draws, for each requested action."""
 
     def init(self, spec: Spec, *, key: Any) -> dict[str, Any]:
         shapes = {"reward": (self.batch_size, self.n_step), "obs": (self.batch_size, self.n_step + 1, OBS)}
@@ -123,7 +123,7 @@ def after(label: Literal["sampled", "stored"], updates: int = 1, longer: Window 
     state = learner.init(method, SPEC, [random_batch(5, OBS, ACTION)], 0)
     for i in range(updates):
         state, actor = learner.update(method, state, WINDOW, EXPERT, longer, np.int32(10 * i), np.int32(i))
-        assert float(actor.trunk.bias[0]) == i + 1, "the actor that is handed out is the one after the update"
+        assert float(actor.trunk.bias[0]) == i + 1, "the returned actor is the one after the update"
     return state
 
 
@@ -131,9 +131,9 @@ def after(label: Literal["sampled", "stored"], updates: int = 1, longer: Window 
 def test_labels_are_of_the_reward_after_its_update_and_of_the_features_before_the_agents(updates: int) -> None:
     state = after("sampled", updates)
     labels = np.asarray(state.agent["reward"]).ravel()
-    assert labels[0] == labels[3] == updates, "the reward's state that labels has seen this update"
-    assert labels[1] == labels[4] == updates - 1, "the features that it is given have not"
-    assert state.reward["features"] == updates - 1, "nor have those on which the reward learns"
+    assert labels[0] == labels[3] == updates, "labels use the reward's state after this update"
+    assert labels[1] == labels[4] == updates - 1, "and features from before it"
+    assert state.reward["features"] == updates - 1, "the reward is trained on these features too"
     assert state.reward["updates"] == state.agent["actor"].trunk.bias[0] == updates
     assert state.agent["step"] == 10 * (updates - 1)
 
@@ -152,7 +152,7 @@ def test_the_reward_learns_from_the_experts_rows_and_the_first_rows_of_the_windo
 
 
 def test_reward_label_and_agent_draw_from_three_keys_of_the_update_and_no_two_updates_share_one() -> None:
-    """The key of update `i` is folded from the root by stream and counter and split in three."""
+    """The key of update `i` is folded from the root key by stream and counter and split into three."""
     drawn = []
     for updates in (1, 2, 3):
         state = after("sampled", updates)
@@ -171,7 +171,7 @@ def test_metrics_are_summed_under_the_name_of_who_gave_them() -> None:
     assert totals == {"agent/was": 0 + 1 + 2, "reward/was": 0 + 1 + 2, "updates": 3}
 
 
-# --- What the loop draws, and when ---
+# --- Random draws of the loop ---
 
 
 def recorded(**changes: Any) -> Run:
@@ -181,7 +181,7 @@ def recorded(**changes: Any) -> Run:
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Windows, expert rows and counters of every update that the loop asks for."""
+    """The windows, expert rows and counters of every update in the loop."""
     updates: list[dict[str, Any]] = []
     real = learner.update
 
@@ -194,7 +194,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
 
 def play(run: Run, episodes: int = 2, action_repeat: int = 1) -> State:
-    """Whole episodes of 50 steps on the point mass, the way that the loop plays and keeps them."""
+    """Play and store whole episodes of 50 steps on the point mass, as the loop does."""
     env, spec = envs.make(POINT_MASS), SPEC._replace(action_repeat=action_repeat)
     state = start(run, spec, DEMOS)
     for _ in range(episodes):
@@ -208,7 +208,7 @@ def same(one: Window, two: Window) -> bool:
 
 
 def test_how_much_an_agent_draws_to_act_changes_nothing_that_is_sampled(drawn: list[dict[str, Any]]) -> None:
-    """The actions are the same, so the replay is; only the generator of acting has been drawn from more often."""
+    """The actions are the same, and so is the replay; only more numbers are drawn from the generator for acting."""
     sampled = []
     for greed in (0, 2, 7):
         drawn.clear()
@@ -220,7 +220,7 @@ def test_how_much_an_agent_draws_to_act_changes_nothing_that_is_sampled(drawn: l
 
 
 def test_how_much_is_sampled_changes_nothing_that_is_drawn_to_act(drawn: list[dict[str, Any]]) -> None:
-    """With twice the windows in an update, and with no updates at all, exploration draws what its own stream gives."""
+    """With twice as many windows in an update, or with no updates, exploration draws the numbers of its own stream."""
     for changes in ({}, {"agent": Scribe(batch_size=12)}, {"seed_frames": 200}):
         play(recorded(**changes))
         for episode in range(2):
@@ -232,7 +232,7 @@ def test_how_much_is_sampled_changes_nothing_that_is_drawn_to_act(drawn: list[di
 def test_windows_and_expert_rows_are_drawn_from_the_episodes_own_stream(drawn: list[dict[str, Any]]) -> None:
     run = recorded(update_every=3)
     play(run, episodes=1)
-    assert drawn == [], "no window before the first episode is kept"
+    assert drawn == [], "no window before the first episode is stored"
     state = play(run, episodes=2)
     drawn.clear()
     collect.play(run, [envs.make(POINT_MASS)], SPEC, state)
@@ -253,7 +253,7 @@ def test_updates_wait_for_the_seed_frames_and_come_every_so_many_steps(repeat: i
 
 @pytest.mark.parametrize("repeat", [1, 2])
 def test_actions_are_uniform_for_the_random_frames_and_the_agents_after_them(repeat: int) -> None:
-    """The uniform ones come from the stream of acting."""
+    """The uniform actions come from the stream for acting."""
     state = play(recorded(random_frames=30 * repeat, seed_frames=150 * repeat), episodes=1, action_repeat=repeat)
     assert [step for step, _, _ in Scribe.acts] == list(range(30, 50))
     held, rng = state.replay.state()["action"], seeds.rng(1, Stream.ACT, 0)
@@ -262,7 +262,7 @@ def test_actions_are_uniform_for_the_random_frames_and_the_agents_after_them(rep
 
 
 def test_acting_is_by_the_actor_that_the_last_update_left(drawn: list[dict[str, Any]]) -> None:
-    """The update of a step is dispatched after its action was chosen, so the action of the next step is the first to know."""
+    """The update of a step is dispatched after its action was chosen, so it first affects the action of the next step."""
     play(recorded(update_every=2), episodes=2)
     for step, updates, _ in Scribe.acts:
         assert updates == sum(update["step"] < step for update in drawn), step
@@ -270,7 +270,7 @@ def test_acting_is_by_the_actor_that_the_last_update_left(drawn: list[dict[str, 
 
 @pytest.mark.parametrize("label", ["sampled", "stored"])
 def test_the_replay_keeps_the_tasks_rewards_or_the_labels_of_when_the_episode_ended(label: str, tmp_path: Path) -> None:
-    """A stored label is by the networks at the end of its episode, which have seen all of its updates."""
+    """A stored label is computed by the networks at the end of its episode, after all of its updates."""
     run = recorded(label=label, frames=150, evaluate_every=150)
     held = loop.train_loop(run, tmp_path, DEMOS).replay.state()
     paid, obs = held["reward"].reshape(3, 51), held["obs"].reshape(3, 51, OBS)

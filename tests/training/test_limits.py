@@ -1,4 +1,4 @@
-"""Limits of every number among the settings, by hand: both ends are taken, and nothing beyond them."""
+"""Limits of all numeric settings, by hand: both limits are accepted, and nothing beyond them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
     },
     POTIL(): {"refresh": (1, inf), "epsilon": (3e-3, inf)},
 }
-"""Least and greatest value of every number that has some, by hand."""
+"""The smallest and largest value of every number with limits, by hand."""
 CASES = [(settings, name, *limits) for settings, numbers in LIMITS.items() for name, limits in numbers.items()]
 
 
@@ -62,7 +62,7 @@ def test_numbers_are_taken_up_to_their_limits_and_no_further(settings: Any, name
 
 @pytest.mark.parametrize("settings", [DrQV2(), BC(), PCIL()])
 def test_true_is_no_whole_number(settings: Any) -> None:
-    """Python has it as 1. What is of no kind of number never gets so far: the hook of the tests refuses it."""
+    """In Python, True equals 1. Values that are not numbers at all are refused earlier, by the type checks of the tests."""
     with pytest.raises(InputError, match=r"\.batch_size is True; it must be a whole number"):
         dataclasses.replace(settings, batch_size=True)
 

@@ -3,8 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
 
-# make mutants FILES="losses noise" N=200: which changes of the source no test notices (docs/mutants.md)
-# make fuzz N=2000, make kills N=100: inputs that are changed at random, runs that are killed and damaged (docs/reliability.md)
+# make mutants FILES="losses noise" N=200: shows which changes of the source no test notices (docs/mutants.md)
+# make fuzz N=2000, make kills N=100: test randomly changed inputs, and runs that are killed and damaged (docs/reliability.md)
 .PHONY: setup train test test-slow mutants fuzz kills check bench docs format clean
 
 setup: $(STAMP)

@@ -1,7 +1,7 @@
-"""What the checks of an environment cost: `python benchmarks/checks.py [TASK ...]`.
+"""The cost of checking an environment: `python benchmarks/checks.py [TASK ...]`.
 
-Blocks of steps with `pcil.envs.checked:Checked` and without it take turns in one process, on one environment and with the same
-actions. The fastest block of each counts, so what else the core did has no part in it.
+Blocks of steps with and without `pcil.envs.checked:Checked` alternate in one process, on one environment and with the same
+actions. Only the fastest block of each counts, so that other work on the core has little influence.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def microseconds(step: Callable[[Any], Any], actions: np.ndarray) -> float:
 
 
 def measure(task: str) -> tuple[float, float]:
-    """Microseconds a step without the checks and with them."""
+    """Microseconds per step without and with the checks."""
     with opened(task) as env:
         actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, spec(env).action_dim)).astype(np.float32)
         plain, checked = [], []

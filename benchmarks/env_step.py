@@ -1,4 +1,4 @@
-"""An environment step and its bare physics: `python benchmarks/env_step.py [TASK ...]`, by default for all ten tasks."""
+"""An environment step and the physics alone: `python benchmarks/env_step.py [TASK ...]`, by default for all ten tasks."""
 
 from __future__ import annotations
 

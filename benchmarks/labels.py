@@ -1,4 +1,4 @@
-"""Rewards of whole episodes and the update, in milliseconds of the processor: `python benchmarks/labels.py [TASK]`."""
+"""Rewards of whole episodes and the update, in milliseconds of processor time: `python benchmarks/labels.py [TASK]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the benchmarks share. Import it first: it asks for one thread, which works only before JAX is imported."""
+"""Code shared by the benchmarks. Import it first: it requests one thread, which works only before JAX is imported."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """POT's and OTT's Sinkhorn solvers, in processor time on one thread: `python benchmarks/sinkhorn.py`.
 
-OTT is no dependency of ours: `pip install ott-jax==0.6.0`.
+OTT is not a dependency of this package: `pip install ott-jax==0.6.0`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ITERATIONS, PADDING, PROBLEMS, BLOCKS = 100, 20, 5, 7
 
 
 def ott_plan(cost: Any, x_weight: Any, y_weight: Any, epsilon: float, *, log_domain: bool) -> Any:
-    """OTT's plan in float32, with POT's number of iterations and its criterion to stop."""
+    """OTT's plan in float32, with POT's number of iterations and stopping criterion."""
     names = "solvers.linear.sinkhorn", "problems.linear.linear_problem", "geometry.geometry"
     solvers, problems, geometries = (importlib.import_module(f"ott.{name}") for name in names)
     cost = jnp.where((x_weight > 0)[:, None] & (y_weight > 0)[None], cost, 0.0)
@@ -83,7 +83,7 @@ def compare(size: int, epsilon: float) -> None:
 
 
 def start(name: str, method: str, folder: str) -> None:
-    """Print the seconds of a first update, a first label and a later label, with this solver and JAX's cache in a folder."""
+    """Print the seconds of the first update, the first and a later label, with this solver and a folder for JAX's cache."""
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     sil.sinkhorn_plan = lambda cost, x_weight, y_weight, epsilon, _: IN_JAX[name](cost, x_weight, y_weight, epsilon)

@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def sweep(folder: Path, task: str, seeds: list[int], frames: int, jobs: int) -> tuple[float, float]:
-    """The seconds that the command takes, and the mean seconds that its runs train."""
+    """The seconds that the command takes, and the mean training time of its runs in seconds."""
     folder.mkdir()
     (folder / "sweep.toml").write_text(FILE.format(task=task, seeds=seeds, frames=frames))
     words = ["sweep", str(folder / "sweep.toml"), "--out", str(folder / "runs"), "--jobs", str(jobs)]

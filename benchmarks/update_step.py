@@ -1,4 +1,4 @@
-"""Each method's update and its matrix products alone, on one thread: `python benchmarks/update_step.py [TASK]`."""
+"""Each method's update compared with its matrix products alone, on one thread: `python benchmarks/update_step.py [TASK]`."""
 
 from __future__ import annotations
 

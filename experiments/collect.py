@@ -15,12 +15,12 @@ from pcil.training.config import renamed
 
 
 def main(target: str, *folders: str) -> None:
-    """A run's variant is its preset, and whatever it has changed from it."""
+    """The variant of a run is its preset and all settings that differ from it."""
     rows = []
     for folder in sorted({done.parent for top in folders for done in Path(top).rglob("DONE")}):
         run = renamed(json.loads((folder / "run.json").read_text())["run"])
         now, before = flat(run), flat(presets.make(run["task"], run["method"], run["preset"]).to_json())
-        decided = {name for name in before if before[name] is None}  # as the run began
+        decided = {name for name in before if before[name] is None}  # settings that were decided when the run began
         differing = (name for name in now if now[name] != before.get(name) and name not in {*NO_VARIANT, "frames", *decided})
         told = [f"{name}={now[name]}" for name in differing]
         rows += read_run(folder, ", ".join([run["preset"], *told]))

@@ -1,7 +1,7 @@
-"""Imitation where episodes end early, with and without the absorbing state: a goal to reach, and a fall to avoid.
+"""Imitation in tasks that may end early, with and without absorbing states: one with a goal, and one with a fall.
 
-python experiments/early_ends.py; each run resumes, and is skipped once it is done.
-InvertedPendulum-v5 wants `pip install imageio`.
+Run python experiments/early_ends.py; interrupted runs resume, and finished ones are skipped.
+InvertedPendulum-v5 needs `pip install imageio`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ EXPERTS = {"toy/reach-v0": lambda obs: Reach.optimal_action(obs).astype(np.float
 
 
 def main() -> None:
-    """One line a task, method and setting: the mean length of an episode, in steps, for each seed."""
+    """Print a line for each task, method and setting: the mean length of an episode, in steps, for each seed."""
     for task, expert in EXPERTS.items():
         place = FOLDER / task.replace("/", "-")
         if not (dataset := place / "demos").exists():

@@ -1,7 +1,7 @@
-"""Train, select and record the experts of experts.toml; run again, it resumes: python experiments/experts.py [TASK ...]
+"""Train, select and record the experts of experts.toml; repeated, it resumes: python experiments/experts.py [TASK ...]
 
-With --record before the tasks nothing is trained: the policies that ship are recorded again, and demonstrations that ship and
-that keep the rule of experts.toml stay as they are, but for what they say of themselves.
+With --record before the tasks nothing is trained: the included policies are recorded again. Included demonstrations that still
+satisfy the rule of experts.toml keep their episodes; only their metadata are updated.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ POLICIES = demos.SHIPPED.parent / "policies"
 RESULTS = HERE.parent / "results" / "experts"
 EPISODES = 10
 MINIMUM_RETURN = 100.0
-"""An episode that returns less does not ship: the authors' release keeps those above 100."""
+"""Episodes with a smaller return are not included; the authors' release keeps those above 100."""
 
 
 def main(wanted: list[str]) -> None:
-    """Every task of the file, or those that are wanted."""
+    """Process every task of the file, or the given ones."""
     plan = tomllib.loads((HERE / "experts.toml").read_text())
     again = "--record" in wanted
     for task in [word for word in wanted if word != "--record"] or plan:
@@ -46,7 +46,7 @@ def main(wanted: list[str]) -> None:
 
 
 def best(task: str, settings: dict[str, Any]) -> Path:
-    """The run folder of the seed with the highest final return; whatever is not finished is trained first."""
+    """The run folder of the seed with the highest final return; unfinished runs are trained first."""
     seeds = settings.pop("seeds")
     del settings["reason"]
     options = [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", str(value))]
@@ -60,20 +60,20 @@ def best(task: str, settings: dict[str, Any]) -> Path:
 
 
 def record(task: str, policy: Policy, seed: int, minimum_return: float, info: dict[str, Any]) -> demos.Demonstrations:
-    """Ten deterministic episodes that keep the rule."""
+    """Record ten deterministic episodes that satisfy the rule."""
     env = envs.make(task)
     return demos.record(policy, env, EPISODES, task=task, seed=seed, minimum_return=minimum_return, info=info)
 
 
 def place(task: str, recorded: demos.Demonstrations) -> Path:
-    """The recorded dataset beside the one that ships, which is yet to be replaced."""
+    """Save the recorded dataset beside the included one, before replacing it."""
     target = demos.SHIPPED / "dmc" / task / "expert-v0"
     shutil.rmtree(target.with_name("fresh"), ignore_errors=True)
     return recorded.save(target.with_name("fresh"), dataset_id=f"dmc/{task}/expert-v0")
 
 
 def record_again(task: str, seed: int, minimum_return: float) -> None:
-    """Record the policy that ships; its training stays what the demonstrations come from."""
+    """Record the included policy again; the information about its training is kept."""
     shipped = demos.Demonstrations.load(task)
     info = {key: value for key, value in shipped.info.items() if not key.startswith("record_")}
     info["record_command"] = f"python experiments/experts.py --record {task}"
@@ -84,18 +84,18 @@ def record_again(task: str, seed: int, minimum_return: float) -> None:
         fresh = place(task, recorded)
         shutil.copy(fresh / "data" / "metadata.json", target / "data" / "metadata.json")
         shutil.rmtree(fresh)
-        print(f"{task}: {said}, the same arrays as those that ship")
+        print(f"{task}: {said}, the same arrays as the included ones")
     elif shipped.returns.min() >= minimum_return:
-        print(f"{task}: {said}, other arrays than those that ship, which keep the rule ({shipped.returns.min():.1f}) and stay")
+        print(f"{task}: {said}, not the included arrays, which satisfy the rule ({shipped.returns.min():.1f}) and are kept")
     else:
         fresh = place(task, recorded)
         shutil.rmtree(target)
         fresh.rename(target)
-        print(f"{task}: {said}, in place of those of before ({shipped.return_mean:.1f}, least {shipped.returns.min():.1f})")
+        print(f"{task}: {said}, replacing the old ones ({shipped.return_mean:.1f}, least {shipped.returns.min():.1f})")
 
 
 def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int, minimum_return: float) -> None:
-    """Ten deterministic episodes and the policy into the package, in place of what was there, and its curve into results."""
+    """Put ten deterministic episodes and the policy into the package, replacing the old ones, and the curve into results."""
     policy = load_policy(folder)
     command = f"python experiments/experts.py {task}"
     info = runs.provenance(folder, policy, command) | {"seeds_tried": tries}

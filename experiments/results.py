@@ -1,8 +1,8 @@
-"""Draw the figures and fill the tables of the docs from results/*.csv and what ships: python experiments/results.py [--check]
+"""Draw the figures and fill the tables of the docs from the files of results: python experiments/results.py [--check]
 
-With --check nothing is written; exit code 1 where a table is stale. A page asks for a table of a report by a pair of marks
-such as `<!-- finals:pcil-200k -->` and `<!-- /finals:pcil-200k -->`: the table's name, and the file of results it is made of.
-`<!-- demos -->` and `<!-- /demos -->` ask for what ships.
+With --check nothing is written, and the exit code is 1 if a table is stale. A page requests a table of a report by two marks
+such as `<!-- finals:pcil-200k -->` and `<!-- /finals:pcil-200k -->`: the table's name, and the file that it is made from.
+`<!-- demos -->` and `<!-- /demos -->` request the table of included demonstrations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MARKED = re.compile(r"(<!-- ([\w:-]+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
 
 
 def main(words: list[str]) -> int:
-    """Every table, and the figures too unless only a check is asked for."""
+    """Fill all tables, and draw the figures unless only a check is requested."""
 
     def fresh(mark: re.Match[str]) -> str:
         name, _, file = mark[2].partition(":")
@@ -55,7 +55,7 @@ def results(name: str) -> Collection:
 
 
 def demos_table() -> str:
-    """What ships: `pcil demos` in Markdown."""
+    """The included demonstrations: `pcil demos` in Markdown."""
     rows = []
     for row in shipped():
         returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"

@@ -1,6 +1,6 @@
-"""What learning looked like over spans of the runs of one method and task: python experiments/spans.py RUN ...
+"""Metrics of runs of one method and task over spans of frames: python experiments/spans.py RUN ...
 
-Each cell is the range over the runs of the mean over a span's episodes, as `train.jsonl` has them; a blank is what no run has.
+Each cell is the range over the runs of the mean over the episodes of a span, from `train.jsonl`; it is blank if no run has any.
 """
 
 import itertools
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 SPANS = ((5, 50), (50, 100), (100, 150), (150, 200))
-"""Thousands of frames."""
+"""Spans, in thousands of frames."""
 ROWS = {
     "correlation of learned and true reward in an episode": "correlation",
     "similarity of positives": "reward/positive_similarity",
@@ -23,10 +23,10 @@ ROWS = {
 
 
 def main(*folders: str) -> None:
-    """One row a quantity, one column a span."""
+    """Print a row for each quantity and a column for each span."""
     logs = [[json.loads(line) for line in (Path(folder) / "train.jsonl").read_text().splitlines()] for folder in folders]
     for episode in itertools.chain(*logs):
-        episode["correlation"] = episode.get("correlation") or None  # older logs have 0 where a reward does not vary
+        episode["correlation"] = episode.get("correlation") or None  # older logs have 0 if a reward does not vary
     print("| frames |" + "".join(f" {low}k to {high}k |" for low, high in SPANS) + f"\n|{'---|' * (len(SPANS) + 1)}")
     for words, name in ROWS.items():
         cells = []

@@ -380,7 +380,7 @@ def main() -> int:
                     whole = run(words, folder, 600.0)  # the first run compiles
                     usual[name] = whole.memory
                     if whole.code != (2 if words[0] == "sweep" else 0) or "Traceback" in whole.said:
-                        print(f"pcil {name} fails on what was not changed:\n{whole.said}")
+                        print(f"pcil {name} fails on unchanged input:\n{whole.said}")
                         return 2
                     shutil.rmtree(folder)
                 shutil.copytree(good, folder)

@@ -203,7 +203,7 @@ def main() -> int:
                 print(f"{number + 1} of {options.number} trials", file=sys.stderr, flush=True)
     for word, count in sorted(kinds.items()):
         print(f"{count:6} {word}")
-    print(f"{options.number - wrong} of {options.number} runs ended as those that were left alone.")
+    print(f"{options.number - wrong} of {options.number} runs ended like uninterrupted ones.")
     return 1 if wrong else 0
 
 

@@ -24,7 +24,7 @@ from pcil.training import checkpoint
 
 
 class Learned(eqx.Module):
-    """A stand-in for a learner: networks, optimiser state, key data, a counter on the device, and settings that are not arrays."""
+    """A stand-in for a learner: networks, optimiser state, key data, a counter on the device, and settings (not arrays)."""
 
     network: MLP
     opt_state: dict[str, Any]

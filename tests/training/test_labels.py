@@ -23,7 +23,7 @@ from small import random_batch
 
 @dataclass(frozen=True)
 class Listener(Reward):
-    """A reward of whole episodes: notes rows, sums and a random draw at the end; a step's reward is made of its row and the note."""
+    """A reward of whole episodes that notes rows, sums and a draw at the end; a step's reward combines its row and the note."""
 
     scope: ClassVar[Literal["step", "episode"]] = "episode"
     padded: bool = False

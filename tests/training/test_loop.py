@@ -1,4 +1,4 @@
-"""The loop: reproducible, and a run that was stopped anywhere equals one that never was, bit for bit."""
+"""The loop is reproducible, and a run that was stopped anywhere equals an uninterrupted one, bit for bit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 class StopAfter(Callback):
-    """Asks to stop after so many episodes; remembers what it was told."""
+    """Asks to stop after a number of episodes; remembers messages."""
 
     def __init__(self, episodes: int) -> None:
         self.left, self.said = episodes, []
@@ -67,7 +67,7 @@ def same_run(one: Path, two: Path) -> None:
 
 
 def finish(run: Run, folder: Path, stops: tuple[int, ...] = ()) -> None:
-    """Run to the end, stopping after so many episodes in each session before the last."""
+    """Run to the end, stopping after the given numbers of episodes in the sessions before the last."""
     for episodes in stops:
         with pytest.raises(loop.Stopped):
             runs.execute(run, folder, [StopAfter(episodes)])
@@ -79,7 +79,7 @@ CASES = [
     ("pcil", "stored", {}),
     ("dac", "sampled", {}),
     ("expert", "stored", {}),
-    ("tcn", "sampled", {"negatives": "rollout", "margin": 5}),  # windows of its own, of ten steps
+    ("tcn", "sampled", {"negatives": "rollout", "margin": 5}),  # draws its own windows of ten steps
     ("pcil-gail", "stored", {"penalty_every": 3, "stages": 2}),
     ("tcn-gail", "sampled", {}),
     *((name, "stored", {}) for name in ("pwil", "sil", "potil")),
@@ -106,7 +106,7 @@ def test_another_seed_gives_another_run(demos: str, tmp_path: Path) -> None:
 
 
 def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path) -> None:
-    """A crash loses the episodes since the checkpoint; their rows are cut off and written again, not twice."""
+    """A crash loses the episodes since the checkpoint; their rows are removed and written again, not duplicated."""
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
 
@@ -114,7 +114,7 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
         pass
 
     class Crash(Callback):
-        """Dies at the end of its second episode."""
+        """Raises at the end of its second episode."""
 
         episodes = 0
 
@@ -133,12 +133,12 @@ def test_what_came_after_the_checkpoint_is_done_again(demos: str, tmp_path: Path
 
 
 def test_a_callback_that_fails_ends_the_run_saved_and_is_named(demos: str, tmp_path: Path) -> None:
-    """The episode of which it was told is not lost: the same command goes on with the next one."""
+    """The episode that it was informed of is not lost: the same command continues with the next one."""
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
 
     class Broken(Callback):
-        """A logger whose server is gone."""
+        """A logger whose server is unavailable."""
 
         def episode(self, row: dict[str, Any]) -> None:
             if row["episode"] == 3:
@@ -154,7 +154,7 @@ def test_a_callback_that_fails_ends_the_run_saved_and_is_named(demos: str, tmp_p
 
 
 def test_callbacks_are_told_every_row_and_every_evaluation_and_what_was_logged_before(demos: str, tmp_path: Path) -> None:
-    """A logger of one's own gets what the files get, in their order, and on resume what they held."""
+    """A user's own logger gets what the files get, in the same order, and on resuming their previous content."""
 
     class Logger(Callback):
         def __init__(self) -> None:
@@ -202,7 +202,7 @@ def test_several_environments_are_played_side_by_side_and_resume_exactly(num_env
 
 
 def one_by_one(demos: str, folder: Path) -> list[dict[str, Any]]:
-    """The rows of the same run in one environment, whose first episodes are the same: they are random."""
+    """The rows of the same run in one environment; its first episodes are the same, since their actions are random."""
     finish(small_run(demos=demos, random_frames=200), folder / "single")
     return rows(folder / "single")[1]
 
@@ -221,11 +221,11 @@ def test_a_damaged_checkpoint_is_passed_over_and_said(demos: str, tmp_path: Path
 
 
 def test_kill_9_at_any_moment_loses_nothing(demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same command again and again, killed three times in between, ends as the run that was left alone."""
+    """The same command, repeated and killed three times, ends like the uninterrupted run."""
     words = f"train {POINT_MASS} --demos {demos} --frames 1500 --seed-frames 100 --random-frames 100 --evaluate-every 300"
     words += " --agent.hidden 16 --reward.hidden 16 --agent.batch-size 32 --reward.batch-size 32 --checkpoint-seconds 0 --out "
     command = [sys.executable, "-m", "pcil", *words.split()]
-    monkeypatch.delenv("XLA_FLAGS")  # a single run uses all cores, and must be exact with them too
+    monkeypatch.delenv("XLA_FLAGS")  # a single run uses all cores, and must be exact with these too
     subprocess.run([*command, "whole"], check=True, stdout=subprocess.DEVNULL)
     whole_rows = len(rows(tmp_path / "whole")[1])
     for episodes in (1, 9, 17):
@@ -233,7 +233,7 @@ def test_kill_9_at_any_moment_loses_nothing(demos: str, tmp_path: Path, monkeypa
         log = tmp_path / "killed" / "train.jsonl"
         while process.poll() is None and not (log.exists() and log.read_bytes().count(b"\n") >= episodes):
             time.sleep(0.01)
-        assert process.poll() is None, "the run must still be going when it is killed"
+        assert process.poll() is None, "the run must still be training when it is killed"
         process.send_signal(signal.SIGKILL)
         process.wait()
     subprocess.run([*command, "killed"], check=True, stdout=subprocess.DEVNULL)
@@ -349,14 +349,14 @@ def test_a_finished_run_without_checkpoint_and_policy_is_refused(demos: str, tmp
     run, folder = small_run(demos=demos), tmp_path / "run"
     finish(run, folder)
     shutil.rmtree(folder / "checkpoint")
-    finish(run, folder)  # a policy without checkpoints is all that one needs
+    finish(run, folder)  # the policy alone is enough
     shutil.rmtree(folder / "policy")
     with pytest.raises(InputError, match=r"holds no policy .*, and no checkpoint has it; delete .*DONE to train it again"):
         runs.execute(run, folder)
 
 
 def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: str, tmp_path: Path) -> None:
-    """As those of before the logs were in it have."""
+    """As in checkpoints of versions that did not store the logs."""
     run = small_run(demos=demos)
     finish(run, tmp_path / "whole")
     for name, size in (("old", 10**6), ("short", 30)):
@@ -480,7 +480,7 @@ def test_a_full_disk_stops_the_run_and_keeps_the_last_checkpoint(
 
 
 def test_updates_come_when_they_are_due(demos: str, tmp_path: Path) -> None:
-    """300 steps, the first 100 without updates, then one every fourth step."""
+    """300 steps: no updates in the first 100, then one every fourth step."""
     finish(small_run(demos=demos, update_every=4), tmp_path / "run")
     _, lines = rows(tmp_path / "run")
     assert [line["updates"] for line in lines] == [0, 0, 13, 25, 38, 50]
@@ -511,7 +511,7 @@ def test_sampled_labels_replace_what_is_stored_and_stored_ones_do_not() -> None:
 
 
 def test_the_actor_that_update_returns_outlives_the_next_update() -> None:
-    """The learner is overwritten in place; the actor that acts meanwhile must not be."""
+    """The learner is overwritten in place; the actor in use must not be."""
     run = small_run("expert")
     state = learner.init(run.learner, Spec(2, 2, 1), (), 0)
     window = windows(random_batch(35, 2, 2), 3)
@@ -526,7 +526,7 @@ def test_the_actor_that_update_returns_outlives_the_next_update() -> None:
 
 @pytest.mark.slow
 def test_pcil_learns_to_walk_from_demonstrations(tmp_path: Path) -> None:
-    """After 40k frames of the default preset it is better than the untrained policy from every start (sign test: 2^-10)."""
+    """After 40k frames with the default preset, it is better than the untrained policy from every start (sign test: 2^-10)."""
     run = presets.make("walker_walk", frames=40_000, evaluate_every=40_000)
     finish(run, tmp_path / "run")
     table, _ = rows(tmp_path / "run")
@@ -536,7 +536,7 @@ def test_pcil_learns_to_walk_from_demonstrations(tmp_path: Path) -> None:
 
 
 class Reused(gymnasium.Env):
-    """Counts its steps in one array that it hands out again and again; cut after four."""
+    """Counts its steps in one array that it always returns; truncated after four."""
 
     observation_space = gymnasium.spaces.Box(0, 9, (1,), np.float32)
     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -580,7 +580,7 @@ def test_demonstrations_too_short_for_a_window_are_refused(demos: str, tmp_path:
 
 @pytest.mark.parametrize("rows", [60, 1000])
 def test_prefill_counts_the_steps_that_went_in_and_pays_them_alpha(rows: int, demos: str) -> None:
-    """120 steps are three demonstrations of 50; a replay of 60 rows keeps the last of them."""
+    """At least 120 steps are three demonstrations of 50; a replay of 60 rows keeps the last of them."""
     run = small_run("pwil", demos=demos, replay_steps=rows, reward={"prefill_steps": 120, "alpha": 3.0, "task_weight": 0.5})
     spec, episodes = envs.spec(envs.make(run.task)), runs.demonstrations(run).episodes
     held = start(run, spec, episodes).replay.state()
@@ -589,7 +589,7 @@ def test_prefill_counts_the_steps_that_went_in_and_pays_them_alpha(rows: int, de
 
 
 def test_pwil_pays_alpha_for_every_step_of_a_copy_of_the_only_demonstration(demos: str) -> None:
-    """Expert and agent are compared by the same states of their steps."""
+    """The same states of each step are compared for expert and agent."""
     run = small_run("pwil", demos=demos, num_demos=1, reward={"alpha": 3.0})
     (copy,) = runs.demonstrations(run).episodes
     state = start(run, envs.spec(envs.make(run.task)), [copy])
@@ -609,7 +609,7 @@ def test_without_a_whole_checkpoint_the_run_begins_again_and_says_so(demos: str,
 
 
 def test_a_run_of_an_older_version_resumes_exactly(demos: str, tmp_path: Path) -> None:
-    """Its arrays and settings had other names, its classes were named by their paths, and its reward kept states alone."""
+    """Its arrays and settings had other names, its classes were named by their paths, and its reward stored only states."""
     run, folder = small_run(demos=demos), tmp_path / "older"
     finish(run, tmp_path / "whole")
     with pytest.raises(loop.Stopped):
@@ -636,7 +636,7 @@ def test_a_run_of_an_older_version_resumes_exactly(demos: str, tmp_path: Path) -
 
 
 def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> None:
-    """As that of another version would be."""
+    """As a checkpoint of another version would be."""
     run, folder = small_run(demos=demos), tmp_path / "run"
     with pytest.raises(loop.Stopped):
         runs.execute(run, folder, [StopAfter(1)])

@@ -1,4 +1,4 @@
-"""Laws of what a run writes: every row is on disk at once, no digit is lost, and rewinding removes what came later."""
+"""The logs of a run: every row is on disk at once, no digit is lost, and rewinding removes exactly the later rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_evaluation(*returns: float) -> Evaluation:
 
 
 class Told(Callback):
-    """Keeps what a person is told."""
+    """Keeps the messages."""
 
     def __init__(self, said: list[str]) -> None:
         self.said = said
@@ -108,7 +108,7 @@ def test_tensorboard_gets_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_success_is_the_last_column_where_the_environment_reports_it(tmp_path: Path) -> None:
-    """From the first evaluation on; the file of a run that goes on keeps its columns, and so does one without."""
+    """From the first evaluation; a resumed run keeps the columns of its file, with or without it."""
     ended = lambda *success: dataclasses.replace(make_evaluation(1.5, -2.0), info={"is_success": np.array(success)})  # noqa: E731
     with writer(tmp_path / "one") as log:
         log.evaluation(2000, 12.34, ended(1.0, 0.0))
@@ -153,7 +153,7 @@ def test_the_columns_are_read_in_the_order_of_time(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kept", [0, 1, 3])
 def test_rewinding_removes_exactly_what_came_later(tmp_path: Path, kept: int) -> None:
-    """Three rounds are written; a second writer starts at the checkpoint after `kept` of them and goes on."""
+    """Three rounds are written; a second writer resumes at the checkpoint after `kept` of them."""
     with writer(tmp_path) as log:
         logs, rows, before = [log.logs()], [log.rows()], [contents(tmp_path)]
         for k in range(3):
@@ -190,7 +190,7 @@ DAMAGE: dict[str, Callable[[bytes], bytes | None]] = {
 @pytest.mark.parametrize("kind", DAMAGE)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_damaged_log_is_written_again(tmp_path: Path, name: str, kind: str) -> None:
-    """It is said, but for what follows a whole log: that was written after the checkpoint."""
+    """A message says so, except if there are only additional rows, which were written after the checkpoint."""
     with writer(tmp_path) as log:
         log.evaluation(0, 0.0, make_evaluation(1.0))
         log.episode({"frames": 0, "return": 1.0})
@@ -217,7 +217,7 @@ def test_a_log_that_is_a_link_is_left_alone(tmp_path: Path) -> None:
 
 
 def points(folder: Path) -> list[tuple[str, int, float, float]]:
-    """What TensorBoard's own reader finds: name, frames, value, and seconds since the first event."""
+    """The points found by TensorBoard's own reader: name, frames, value, and seconds since the first event."""
     from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 
     found, began = [], None
@@ -233,7 +233,7 @@ def points(folder: Path) -> list[tuple[str, int, float, float]]:
 
 
 def test_tensorboard_is_written_again_from_the_logs(tmp_path: Path) -> None:
-    """Whatever a kill left of it: points of before the checkpoint are there once, and none of after it."""
+    """Whatever a kill left of it, points before the checkpoint appear once, and later points not at all."""
     with writer(tmp_path) as log:
         log.evaluation(1000, 5.0, make_evaluation(1.0, 2.0))
         log.episode({"frames": 1000, "return": 0.5, "reward/loss": 0.25, "length": 3, "seconds": 5.5})
@@ -279,7 +279,7 @@ def test_the_correlation_is_the_covariance_over_both_deviations(x: np.ndarray, y
 @pytest.mark.parametrize("constant", [0.0, 1.0, 0.1, 33.3, 1000.1])
 @pytest.mark.parametrize("length", [7, 500, 501])
 def test_what_does_not_vary_has_no_correlation(constant: float, length: int) -> None:
-    """Also where the mean of equal float32 numbers is not that number."""
+    """Even if the mean of equal float32 numbers differs from that number."""
     flat, line = np.full(length, constant, np.float32), np.linspace(0.0, 1.0, length, dtype=np.float32)
     assert pearson(flat, line) is None
     assert pearson(line, flat) is None

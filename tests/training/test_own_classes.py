@@ -1,4 +1,4 @@
-"""Classes of a user's own, outside the package: agents, actors and callbacks, from Python and from the command line."""
+"""A user's own classes, outside the package: agents, actors and callbacks, from Python and from the command line."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def test_callbacks_must_be_a_list_of_callbacks(callbacks: Any, tmp_path: Path) -
 
 
 class Recorder(Callback):
-    """Writes down what it is told, and raises where it is asked to."""
+    """Records its calls, and raises on request."""
 
     def __init__(self, log: list[str], name: str, raises: str = "") -> None:
         self.log, self.name, self.raises = log, name, raises

@@ -1,4 +1,4 @@
-"""What the loop does in each of its passes, with a clock that stands until it is moved."""
+"""The passes of the loop, with a clock that is moved by hand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from small import POINT_MASS
 
 
 class StandingClock(Clock):
-    """Time goes on where `now` is moved alone."""
+    """A clock that changes only when `now` is set."""
 
     now: ClassVar[float] = 0.0
 
@@ -41,7 +41,7 @@ class StandingClock(Clock):
 
 
 class Heard(Callback):
-    """Moves the clock by ten seconds an episode, and remembers what it is told."""
+    """Moves the clock by ten seconds in each episode, and records its calls."""
 
     def __init__(self, step: float = 10.0) -> None:
         self.step, self.runs, self.episodes, self.evaluations = step, [], [], []
@@ -94,7 +94,7 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 def test_a_checkpoint_is_written_once_so_many_seconds_have_passed_since_the_last(
     seconds: float, expected: list[int], saves: list[int], tmp_path: Path
 ) -> None:
-    """Each episode of 50 steps takes ten seconds; the last checkpoint is that of the finished run."""
+    """Each episode of 50 steps takes ten seconds; the last checkpoint is the one of the finished run."""
     loop.train_loop(recorded(frames=400, evaluate_every=400, checkpoint_seconds=seconds), tmp_path, DEMOS, [Heard()])
     assert saves == [*expected, 400]
 
@@ -135,7 +135,7 @@ def test_each_action_is_of_the_observation_before_it_and_each_episode_of_its_own
 
 
 class Held:
-    """A replay with so many windows of a length."""
+    """A replay with a given number of windows of a length."""
 
     def __init__(self, windows: int, steps: int) -> None:
         self.windows, self.steps = windows, steps
@@ -158,7 +158,7 @@ def test_an_update_is_due_from_the_seed_frames_on_where_one_window_is_there(
 
 
 def test_a_pass_is_refused_where_no_window_fits_into_any_of_its_episodes() -> None:
-    """With several environments that is known once all of them are stored: a short one may come first."""
+    """With several environments, this is decided after all episodes are stored, because a short one may come first."""
 
     def ended(steps: int) -> collect.Labelled:
         obs, action = np.zeros((steps + 1, 2), np.float32), np.zeros((steps, 2), np.float32)
@@ -202,7 +202,7 @@ class Nothing(Recorder):
 def test_an_offline_agent_has_passes_of_500_updates_on_draws_of_the_demonstrations(
     monkeypatch: pytest.MonkeyPatch, saves: list[int], tmp_path: Path
 ) -> None:
-    """The last pass ends with the frames; what is drawn comes from the stream of its pass."""
+    """The last pass ends when the frames are used up; random draws come from the stream of the pass."""
     updates: list[Any] = []
     real = learner.update
 

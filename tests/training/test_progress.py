@@ -1,4 +1,4 @@
-"""What a person sees on a terminal."""
+"""The output on a terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from small import small_run
 
 
 def shown(expert: float | None, **changes: Any) -> str:
-    """Everything that a terminal of 140 columns gets from one evaluation and two episodes."""
+    """The output on a terminal with 140 columns for one evaluation and two episodes."""
     stream = io.StringIO()
     run = dataclasses.replace(small_run("expert", frames=100_000), **changes)
     with Bar(Console(file=stream, force_terminal=True, width=140, color_system=None), expert) as bar:

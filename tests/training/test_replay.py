@@ -1,6 +1,6 @@
-"""Laws of the replay: every window it returns is one that a plain list of episodes would give, and all are equally likely.
+"""The replay: every window that it returns is one that a list of episodes would give, and all are equally likely.
 
-Each row names itself: the observation at time t of episode e is `1000 e + t`, and action and reward follow from it.
+Each row identifies itself: the observation at time t of episode e is `1000 e + t`, which determines action and reward.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ law = settings(deadline=None, derandomize=True, max_examples=60)
 def make_episode(name: int, steps: int, terminated: bool) -> Episode:
     t = np.arange(steps + 1, dtype=np.float32) + 1000 * name
     obs, action = np.stack([t, t + 0.25], axis=1), -t[:-1, None]
-    return Episode(obs, action, np.full(steps, np.nan), terminated)  # what is stored is not the episode's own reward
+    return Episode(obs, action, np.full(steps, np.nan), terminated)  # the stored rewards are not the episode's own
 
 
 def stored_reward(episode: Episode) -> np.ndarray:
@@ -32,7 +32,7 @@ def stored_reward(episode: Episode) -> np.ndarray:
 
 
 class ListOfEpisodes:
-    """The second implementation: whole episodes in a list, the oldest dropped until rows for the next are free."""
+    """The second implementation: whole episodes in a list; the oldest are dropped until there are free rows for the next."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity, self.episodes = capacity, []
@@ -64,13 +64,13 @@ class ListOfEpisodes:
 
 
 def check(window: Window, expected: dict, batch: int, n: int) -> list[float]:
-    """Every row is one of the enumerated windows, exactly; returns which."""
+    """Check that every row is exactly one of the enumerated windows; returns their first observations."""
     assert window.obs.shape == (batch, n + 1, 2) and window.action.shape == (batch, n, 1)
     assert window.reward.shape == window.discount.shape == (batch, n)
     assert all(array.dtype == np.float32 for array in window[:4]) and window.episode_id.dtype == np.int32
     rows = zip(*(array.tolist() for array in window), strict=True)
     for obs, action, reward, discount, number in rows:
-        assert number == obs[0][0] // 1000, "episodes are named in the order in which they are added"
+        assert number == obs[0][0] // 1000, "episodes are numbered in the order in which they are added"
         true_obs, true_action, true_reward, true_discount = expected[obs[0][0]]
         assert obs == true_obs
         assert action == true_action
@@ -89,7 +89,7 @@ def fill(capacity: int, *shapes: tuple[int, bool]) -> tuple[Replay, ListOfEpisod
 
 
 class Machine(stateful.RuleBasedStateMachine):
-    """Anything that may happen to a replay of 24 rows, in any order."""
+    """All operations on a replay of 24 rows, in any order."""
 
     capacity = 24
 
@@ -147,7 +147,7 @@ TestAnythingThatMayHappen.settings = settings(law, max_examples=40, stateful_ste
 
 @pytest.mark.parametrize("offset", range(5))
 def test_a_window_that_meets_a_termination_is_padded_from_there_on(offset: int) -> None:
-    """Five steps, windows of three: the start is `offset`; by hand rather than by the second implementation."""
+    """Five steps and windows of three that start at `offset`, by hand instead of with the second implementation."""
     replay, _ = fill(20, (5, True))
     window = replay.sample(np.random.default_rng(0), 200, 3)
     row = next(i for i in range(200) if window.obs[i, 0, 0] == offset)
@@ -169,7 +169,7 @@ def test_a_time_limit_is_no_termination_and_no_window_reaches_past_it(n: int) ->
         window = replay.sample(np.random.default_rng(0), 100, n)
         assert set(window.obs[:, 0, 0].tolist()) == set(range(5 - n + 1))
         assert window.discount.min() == 1
-        assert window.obs[:, -1, 0].max() == 5  # the final observation is seen, as the last of a window
+        assert window.obs[:, -1, 0].max() == 5  # the final observation appears as the last of a window
 
 
 def test_windows_of_one_step_are_all_transitions() -> None:
@@ -179,12 +179,12 @@ def test_windows_of_one_step_are_all_transitions() -> None:
     assert len(set(drawn)) == 10
 
 
-# --- Chance ---
+# --- Random draws ---
 
 
 @pytest.mark.parametrize("n", [1, 3])
 def test_every_valid_start_is_drawn_and_all_equally_often(n: int) -> None:
-    """Chi-square at a fixed seed, over a ring that has wrapped and holds episodes without a window of 3."""
+    """A chi-square test with a fixed seed, on a full ring buffer that also holds episodes without a window of 3."""
     replay, naive = fill(30, (9, False), (2, False), (7, True), (1, True), (5, False), (2, False), (3, False))
     expected = naive.windows(n)
     drawn = Counter(check(replay.sample(np.random.default_rng(5), 20_000, n), expected, 20_000, n))
@@ -202,11 +202,11 @@ def test_the_same_generator_draws_the_same_windows() -> None:
     assert first.obs.tolist() != other.obs.tolist()
 
 
-# --- The ring ---
+# --- The ring buffer ---
 
 
 def test_the_oldest_episodes_leave_whole_and_only_when_their_rows_are_needed() -> None:
-    """Rows 4 + 5 + 3 = 12 fill the ring; 2 more drop the first; 8 more drop the next two."""
+    """Rows 4 + 5 + 3 = 12 fill the ring buffer; 2 more drop the first episode; 8 more drop the next two."""
     replay, _ = fill(12, (3, True), (4, True), (2, True))
     assert (replay.num_episodes, replay.num_steps) == (3, 9)
     for name, steps, left in ((3, 1, [1, 2, 3]), (4, 7, [3, 4])):
@@ -228,7 +228,7 @@ def test_an_episode_that_fills_the_ring_fits_and_one_row_more_is_refused() -> No
     assert (replay.num_episodes, replay.num_windows(9)) == (1, 1)
     with pytest.raises(InputError, match="An episode of 10 steps does not fit into a replay of 10 rows"):
         replay.add(make_episode(2, 10, False), np.zeros(10))
-    check(replay.sample(np.random.default_rng(0), 5, 9), naive.windows(9), 5, 9)  # and the refusal changed nothing
+    check(replay.sample(np.random.default_rng(0), 5, 9), naive.windows(9), 5, 9)  # the refused call changed nothing
 
 
 def test_a_replay_of_episodes_holds_them_all_with_their_own_rewards_and_no_row_more() -> None:
@@ -274,7 +274,7 @@ shapes = st.lists(st.tuples(st.integers(1, 12), st.booleans()), max_size=8)
 @law
 @given(shapes, shapes, st.sampled_from([1, 3]))
 def test_a_restored_replay_goes_on_as_the_first_would_have(before: list, after: list, n: int) -> None:
-    """Bit for bit, padding included: the same draws now, and after further episodes."""
+    """Bit for bit, including padding: the same draws now, and after further episodes."""
     replay, _ = fill(25, *before)
     restored = Replay(25, 2, 1)
     restored.load(replay.state())

@@ -1,4 +1,4 @@
-"""Units are the user's business: an observation entry in other units, `a x + b`, changes an update by rounding alone."""
+"""Units make no difference: an observation entry in other units, `a x + b`, changes an update only by rounding."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def method_of(name: str) -> Algorithm:
 
 @dataclasses.dataclass(frozen=True)
 class Units:
-    """Entry `i` of an observation `x` is given as `scale[i] x + offset[i]`, rounded once to float32."""
+    """Units in which entry `i` of an observation `x` is `scale[i] x + offset[i]`, rounded once to float32."""
 
     scale: np.ndarray
     offset: np.ndarray
@@ -42,7 +42,7 @@ class Units:
 
 
 def draws(method: Algorithm, units: Units) -> tuple[list[Batch], Any, Episode]:
-    """Demonstrations, a function that draws windows, and an episode; the expert never moves entry 3, nobody moves entry 4."""
+    """Demonstrations, a function that draws windows, and an episode; entry 3 is constant for the expert, entry 4 for both."""
     rng = np.random.default_rng(0)
 
     def states(*shape: int, still: bool) -> np.ndarray:
@@ -65,7 +65,7 @@ def draws(method: Algorithm, units: Units) -> tuple[list[Batch], Any, Episode]:
 
 
 def learned(name: str, units: Units) -> dict[str, np.ndarray]:
-    """Labels, actions and metrics after some updates from the first one on."""
+    """Labels, actions and metrics after several updates."""
     method = method_of(name)
     agent, reward = method.agent, method.reward
     demos, windows, episode = draws(method, units)
@@ -103,7 +103,7 @@ entries = st.lists(
 @example([(1.0, 1000.0), (1e-6, 0.0), (1e6, 0.0), (1e6, -1e9), (1.0, 0.0)])
 @given(entries)
 def test_other_units_change_an_update_by_rounding_alone(name: str, entries: list[tuple[float, float]]) -> None:
-    """An offset of 1000 deviations costs an entry three of float32's seven digits."""
+    """An offset of 1000 standard deviations costs an entry three of float32's seven digits."""
     scale, offset = np.array(entries).T
     ours, theirs = in_plain_units(name), learned(name, Units(scale, offset))
     for what, value in ours.items():
@@ -121,7 +121,7 @@ UNITS = {
 
 @pytest.mark.parametrize("name", UNITS)
 def test_cloning_learns_in_any_units_beside_a_huge_constant(name: str) -> None:
-    """At an offset of 1e6 float32 tells apart what is 0.06 apart, and no more is lost than that."""
+    """At an offset of 1e6, float32 has a resolution of 0.06, and no more precision than that is lost."""
     run = presets.make("walker_walk", "bc")
     method = Algorithm(narrow(run.agent, hidden=32, learning_rate=3e-3), run.reward, run.label)
     rng = np.random.default_rng(0)

@@ -19,7 +19,7 @@ from pcil import cli
 from pcil.report import load, page, tables
 
 OTHERS: list[Any] = [None, True, "x", "", "3", -1, 1.5, 10**60, -(10**299), math.nan, math.inf, 1e300, [], [1], {}, {"a": 1}]
-"""Values of unexpected types."""
+"""Unexpected values."""
 
 
 def told(folder: Path, *names: str, value: Any) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from pcil import envs
+from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError
 from pcil.policy import load_policy
 from pcil.training import checkpoint, collect, learner, loop, presets, runs
@@ -653,3 +654,42 @@ def test_a_replay_smaller_than_an_episode_is_refused_before_anything_is_written(
     with pytest.raises(InputError, match="has 4 rows, and an episode of pcil_test/reused-v0 may take 5"):
         runs.execute(small_run("expert", reused, replay_steps=4), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("stops", [(), (1, 2)])
+def test_a_run_ends_when_two_evaluations_in_a_row_reach_the_share(
+    stops: tuple[int, ...], demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 95% of 10, the third and fourth of these evaluations are the first two in a row that are good enough."""
+    shares = iter([0.96, 0.94, 0.95, 2.0, 0.1, 0.1, 0.1])
+    demos_return = Demonstrations.load(demos).return_mean
+    assert demos_return is not None and demos_return > 0
+
+    def evaluated(*_: Any, episodes: int, **__: Any) -> Evaluation:
+        return Evaluation(np.full(episodes, next(shares) * demos_return), np.full(episodes, 50), 0.0)
+
+    monkeypatch.setattr(loop, "evaluate", evaluated)
+    run = small_run(demos=demos, until=0.95, frames=600)
+    stop = StopAfter(-1)
+    for episodes in stops:
+        with pytest.raises(loop.Stopped):
+            runs.execute(run, tmp_path, [StopAfter(episodes)])
+    result = runs.execute(run, tmp_path, [stop])
+    assert result.final_return == pytest.approx(2 * demos_return)
+    assert [row[0] for row in rows(tmp_path)[0][1::2]] == ["0", "100", "200", "300"]
+    assert rows(tmp_path)[1][-1]["frames"] == 300
+    assert "Two evaluations in a row reached 95% of the demonstrations' mean return." in stop.said
+    assert load_policy(tmp_path).info["frames"] == 300
+    assert runs.execute(run, tmp_path) == result
+
+
+def test_until_changes_nothing_of_a_run_before_it_ends(demos: str, tmp_path: Path) -> None:
+    finish(small_run(demos=demos), tmp_path / "plain")
+    finish(small_run(demos=demos, until=1e6), tmp_path / "until")
+    assert rows(tmp_path / "plain") == rows(tmp_path / "until")
+
+
+def test_until_needs_demonstrations_of_positive_return(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--until is a share of the demonstrations' mean return, .* but expert needs none"):
+        runs.execute(small_run("expert", until=0.9), tmp_path / "run")
+    assert not (tmp_path / "run" / "run.json").exists()

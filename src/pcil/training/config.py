@@ -60,6 +60,9 @@ class Run:
     """The seed of everything random."""
     frames: int = 500_000
     """Length of the run, in frames."""
+    until: float | None = None
+    """End the run early, when the mean return of two evaluations in a row is at least this share of the demonstrations' mean
+    return (0.95, for example). By default the run takes all its frames."""
     demos: str | None = None
     """A shipped task, the folder of a Minari dataset or the id of a local one; by default what ships for the task."""
     num_demos: int | None = None
@@ -129,6 +132,8 @@ class Run:
             random_frames=(0, inf),
             checkpoint_seconds=(0, inf),
         )
+        if self.until is not None:
+            check_ranges(self, until=(1e-6, inf))
 
     @property
     def learner(self) -> Algorithm:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +29,9 @@ def train_loop(
     task: Any = None,
     demos_return: float | None = None,
 ) -> states.State:
-    """Train until `run.frames`, resuming from the folder's newest whole checkpoint; a pass of the loop is an episode in each
-    of `run.num_envs` environments, or some hundred updates of an offline agent.
+    """Train for `run.frames`, or until the share `run.until` of `demos_return`, resuming from the folder's newest whole
+    checkpoint. A pass of the loop is an episode in each of `run.num_envs` environments, or some hundred updates of an offline
+    agent.
 
     `demos` may be empty where nothing needs them. `task` makes the environments, by default `run.task`. Returns the final
     state, with the final return in its counters. Raises `Stopped` where a callback asks for it, and `InputError` or `RunError`
@@ -54,18 +54,23 @@ def train_loop(
         stack.callback(told.end)
         told.begin(run, folder, log.history(clock.total(), demos_return))
 
-        def evaluated() -> float:
-            result = evaluate(state.policy(), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
-            told.evaluation(state.counters.frames, clock.total(), result)
-            state.counters = replace(state.counters, evaluations=state.counters.evaluations + 1)
-            states.save_policy(run, folder, state, spec, result.mean)
-            return result.mean
-
+        if state.counters.final_return is not None:
+            states.save_policy(run, folder, state, spec, state.counters.final_return)
         saved = clock.total()
-        while state.counters.frames < run.frames:
+        while state.counters.final_return is None:
             with states.saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
-                if state.counters.frames >= state.counters.evaluations * run.evaluate_every:
-                    evaluated()
+                if state.counters.frames >= min(state.counters.evaluations * run.evaluate_every, run.frames):
+                    result = evaluate(state.policy(), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
+                    told.evaluation(state.counters.frames, clock.total(), result)
+                    state.counters = states.evaluated(run, state.counters, result.mean, demos_return)
+                    states.save_policy(run, folder, state, spec, result.mean)
+                    if state.counters.final_return is not None:
+                        if state.counters.frames < run.frames:
+                            told.message(
+                                f"Two evaluations in a row reached {run.until:.0%} of the demonstrations' mean return."
+                            )
+                        states.save(folder, state, log.contents(), clock)
+                        break
                 first = state.counters.episodes + 1
                 episodes = study(run, spec, state) if run.agent.offline else play(run, training, spec, state)
                 refuse_divergence()
@@ -83,12 +88,4 @@ def train_loop(
                 saved = clock.total()
             if stop:
                 raise Stopped
-
-        if state.counters.final_return is None:
-            with states.saved_on_failure(run, folder, state, log, clock):
-                final_return = evaluated()
-            state.counters = replace(state.counters, final_return=final_return)
-            states.save(folder, state, log.contents(), clock)
-        else:
-            states.save_policy(run, folder, state, spec, state.counters.final_return)
     return state

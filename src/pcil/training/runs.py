@@ -176,6 +176,9 @@ def prepared(
     """
     with envs.opened(run.task if task is None else task, env_kwargs=run.env_kwargs) as environment:
         demos = _fitted(run, environment, say, read)
+        if run.until is not None and not (demos and demos.return_mean and demos.return_mean > 0):
+            found = f"their mean return is {demos.return_mean}" if demos else f"{run.method} needs none here"
+            raise InputError(f"--until is a share of the demonstrations' mean return, which must be positive, but {found}.")
         run, why = with_absorbing_decided(run, demos, envs.ends_early(environment))
     return run, demos, why
 

@@ -61,6 +61,8 @@ class Counters:
     episodes: int = 0
     updates: int = 0
     evaluations: int = 0
+    good_evaluations: int = 0
+    """The last evaluations, in a row, that reached the share `until` of the demonstrations' return."""
     seconds: float = 0.0
     """Wall-clock time until now, over all sessions."""
     final_return: float | None = None
@@ -107,6 +109,20 @@ def absorbed(run: Run, episode: Episode) -> Episode:
     """The episode as the run learns from it. With an absorbing state, an episode that terminated gets as many absorbing
     steps as it has steps, so that half of what a reward sees of it is its end, whatever its length."""
     return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
+
+
+def evaluated(run: Run, counters: Counters, return_mean: float, demos_return: float | None) -> Counters:
+    """The counters after an evaluation. It is the last one if the run has all its frames, or if two evaluations in a row have
+    reached the share `run.until` of the demonstrations' mean return."""
+    good = run.until is not None and demos_return is not None and return_mean >= run.until * demos_return
+    good_evaluations = counters.good_evaluations + 1 if good else 0
+    last = counters.frames >= run.frames or good_evaluations == 2
+    return replace(
+        counters,
+        evaluations=counters.evaluations + 1,
+        good_evaluations=good_evaluations,
+        final_return=return_mean if last else None,
+    )
 
 
 def save(folder: Path, state: State, logs: dict[str, str], clock: Clock) -> None:

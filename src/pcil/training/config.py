@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -135,7 +136,7 @@ class Run:
         """The settings that are compiled."""
         return Algorithm(self.agent, self.reward, self.label)
 
-    @property
+    @functools.cached_property
     def own_modules(self) -> tuple[str, ...]:
         """The modules of an agent and a reward that are none of ours, and that of such an agent's actor."""
         kinds = [type(self.agent), type(self.reward)]

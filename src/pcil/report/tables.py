@@ -186,8 +186,8 @@ MAKERS: dict[str, Maker] = {
 }
 
 
-def title_and_caption(make: Maker) -> tuple[str, str]:
-    """The title and the caption of a maker's table."""
+def title_and_caption(make: Callable[..., Any]) -> tuple[str, str]:
+    """The title and the caption of what a maker of tables or figures makes."""
     title, _, caption = " ".join((make.__doc__ or "").split()).partition(": ")
     return title, caption[:1].upper() + caption[1:]
 

@@ -149,13 +149,13 @@ class LogFiles(Callback):
             self._files["eval.csv"].seek(0)
             held.clear()
             self._write("eval.csv", ",".join([*EVAL_COLUMNS, "success"]) + "\n")
-        columns = [range(len(result.returns)), map(repr, result.returns.tolist()), result.lengths.tolist()]
-        columns += [[f"{seconds:.1f}"] * len(result.returns)]
-        if held[0].partition("\n")[0].endswith(",success"):
-            columns.append([f"{value:g}" for value in result.success or [float("nan")] * len(result.returns)])
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows((frames, *row) for row in zip(*columns, strict=True))
-        self._write("eval.csv", text.getvalue())
+        with_success = held[0].partition("\n")[0].endswith(",success")
+        success = result.success or [math.nan] * len(result.returns)
+        lines = []
+        for i, (paid, length, won) in enumerate(zip(result.returns.tolist(), result.lengths.tolist(), success, strict=True)):
+            cells = [frames, i, paid, length, f"{seconds:.1f}", *([f"{won:g}"] if with_success else [])]
+            lines.append(",".join(map(str, cells)) + "\n")
+        self._write("eval.csv", "".join(lines))
 
     def end(self) -> None:
         for file in self._files.values():

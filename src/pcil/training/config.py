@@ -121,9 +121,6 @@ class Run:
             evaluate_every=(1, inf),
             evaluate_episodes=(1, inf),
             replay_steps=(1, inf),
-        )
-        check_ranges(
-            self,
             frames=(1, inf),
             seed=(0, 2**31 - 1),
             seed_frames=(0, inf),

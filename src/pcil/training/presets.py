@@ -191,30 +191,27 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     for name in ("every preset", preset):
         own = METHOD_SETTINGS[method].get(name, {})
         settings |= own(task) if callable(own) else own
-    parts = {part: changes.pop(part, settings[part]) for part in REGISTRIES}
-    made = {
-        part: modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
-        for part, named in parts.items()
-    }
-    settings = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)} | changes
-    for part, instance in made.items():
-        own = {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
-        made[part] = changed(instance, own)
+    made: dict[str, Any] = {}
+    for part in REGISTRIES:
+        usual, own, asked = settings.pop(part), _taken(settings, part), _taken(changes, part)
+        named = changes.pop(part, usual)
+        made[part] = modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
+        if named != usual:
+            own = {}
+        elif part == "agent":
+            own = {name: value for name, value in own.items() if hasattr(made[part], name)}
+        elif not made[part].needs_demos:
+            own.pop("batch_size", None)
+        made[part] = changed(made[part], own | asked)
+    settings |= changes
     known = {field.name for field in dataclasses.fields(Run)}
     plain = {name: settings.pop(name) for name in list(settings) if name in known}
     return changed(Run(task=task, method=method, preset=preset, **made, **plain), settings)
 
 
-def _counts(name: str, made: dict[str, Any], settings: dict[str, Any], parts: dict[str, Any]) -> bool:
-    """Whether a setting of the preset or the method applies to these parts."""
-    part, _, rest = name.partition(".")
-    if not rest:
-        return name not in parts
-    if parts[part] != settings[part]:
-        return False
-    if part == "agent":
-        return hasattr(made[part], rest.partition(".")[0])
-    return rest != "batch_size" or made[part].needs_demos
+def _taken(settings: dict[str, Any], part: str) -> dict[str, Any]:
+    """The settings of a part, which are taken out of `settings`."""
+    return {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
 
 
 def _known(kind: str, name: Any, names: Any) -> None:

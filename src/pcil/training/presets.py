@@ -13,7 +13,7 @@ from typing import Any
 from pcil import modules
 from pcil.errors import InputError, brief
 from pcil.nets.noise import LinearSchedule
-from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed
+from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed, taken
 
 
 def paper(task: str) -> dict[str, Any]:
@@ -193,7 +193,7 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
         settings |= own(task) if callable(own) else own
     made: dict[str, Any] = {}
     for part in REGISTRIES:
-        usual, own, asked = settings.pop(part), _taken(settings, part), _taken(changes, part)
+        usual, own, asked = settings.pop(part), taken(settings, part), taken(changes, part)
         named = changes.pop(part, usual)
         made[part] = modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
         if named != usual:
@@ -207,11 +207,6 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     known = {field.name for field in dataclasses.fields(Run)}
     plain = {name: settings.pop(name) for name in list(settings) if name in known}
     return changed(Run(task=task, method=method, preset=preset, **made, **plain), settings)
-
-
-def _taken(settings: dict[str, Any], part: str) -> dict[str, Any]:
-    """The settings of a part, which are taken out of `settings`."""
-    return {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
 
 
 def _known(kind: str, name: Any, names: Any) -> None:

@@ -84,7 +84,7 @@ def read_text(path: Path, limit: int = LARGEST) -> str:
 def write_text(path: Path, text: str) -> None:
     """Write a file atomically: after a crash or a power failure it has either its old or its new content."""
     partial = path.with_suffix(path.suffix + ".tmp")
-    with partial.open("w") as file:
+    with partial.open("w", newline="", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())

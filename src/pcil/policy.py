@@ -181,26 +181,21 @@ def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:
         arrays[name] = array.astype(np.float32, copy=False)
         if array.dtype.kind != "f" or 0 in array.shape or not np.isfinite(arrays[name]).all():
             raise ValueError(f"{name} of shape {array.shape} and dtype {array.dtype} must hold finite numbers")
+    scaling = [name for name in ("trunk.normalizer.mean", "trunk.normalizer.deviation") if name in arrays]
     layers = range(int(header["layers"]))
-    scaling = [arrays[name] for name in ("trunk.normalizer.mean", "trunk.normalizer.deviation") if name in arrays]
-    normalizer = Normalizer(*scaling) if scaling else None  # older policies have the scale in their first layer
-    weight, bias, scale, offset = (arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset"))
-    trunk = Trunk(weight, bias, scale, offset, normalizer)
-    weights = tuple(arrays[f"head.weights.{i}"] for i in layers)
-    biases = tuple(arrays[f"head.biases.{i}"] for i in layers)
-    if not layers or len(arrays) != 4 + len(scaling) + 2 * len(layers):
-        raise ValueError("names and arrays do not fit")
-    if not (trunk.weight.ndim == 2 and all(bias.ndim == 1 for bias in biases)):
-        raise ValueError("its weights are no matrices or its biases no vectors")
-    width = trunk.weight.shape[1]
-    if not trunk.bias.shape == trunk.scale.shape == trunk.offset.shape == (width,):
-        raise ValueError("the trunk's shapes do not fit")
-    if any(array.shape != trunk.weight.shape[:1] for array in scaling):
-        raise ValueError("the shapes of its scaling do not fit")
-    if scaling and not (scaling[1] > 0).all():
+    obs_dim, width = arrays["trunk.weight"].shape[:2]
+    expected = {"trunk.weight": (obs_dim, width), **dict.fromkeys(scaling, (obs_dim,))}
+    expected |= dict.fromkeys(("trunk.bias", "trunk.scale", "trunk.offset"), (width,))
+    for i in layers:
+        outputs = len(arrays[f"head.biases.{i}"])
+        expected |= {f"head.weights.{i}": (width, outputs), f"head.biases.{i}": (outputs,)}
+        width = outputs
+    wrong = sorted({name: array.shape for name, array in arrays.items()}.items() ^ expected.items())
+    if wrong or not layers:
+        raise ValueError(f"names and shapes of its arrays do not fit each other: {wrong[:4]}")
+    if scaling and not (arrays[scaling[-1]] > 0).all():
         raise ValueError("its scaling has deviations that are not above 0")
-    for weight, bias in zip(weights, biases, strict=True):
-        if weight.shape != (width, *bias.shape):
-            raise ValueError(f"a layer of shape {weight.shape} follows one of width {width}")
-        width = bias.shape[0]
-    return Actor(trunk, MLP(weights, biases))
+    normalizer = Normalizer(*(arrays[name] for name in scaling)) if scaling else None  # older ones scale in their first layer
+    weight, bias, scale, offset = (arrays[f"trunk.{name}"] for name in ("weight", "bias", "scale", "offset"))
+    weights, biases = (tuple(arrays[f"head.{kind}.{i}"] for i in layers) for kind in ("weights", "biases"))
+    return Actor(Trunk(weight, bias, scale, offset, normalizer), MLP(weights, biases))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,11 +115,11 @@ class Episode:
         """
         obs = np.pad(self.obs, ((0, 0), (0, 1)))
         if not self.terminated:
-            return Episode(obs, self.action, self.reward, False, self.seed)
+            return replace(self, obs=obs)
         rest = np.zeros((steps + 1, obs.shape[1]), obs.dtype)
         rest[:, -1] = 1
         action, reward = np.pad(self.action, ((0, steps), (0, 0))), np.pad(self.reward, (0, steps))
-        return Episode(np.concatenate([obs[:-1], rest]), action, reward, False, self.seed)
+        return replace(self, obs=np.concatenate([obs[:-1], rest]), action=action, reward=reward, terminated=False)
 
     @property
     def total_reward(self) -> float:

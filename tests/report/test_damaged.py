@@ -16,7 +16,7 @@ import pytest
 
 from fake_runs import fake_run, fake_sweep
 from pcil import cli
-from pcil.report import load, page, tables
+from pcil.report import figures, load, page, tables
 
 OTHERS: list[Any] = [None, True, "x", "", "3", -1, 1.5, 10**60, -(10**299), math.nan, math.inf, 1e300, [], [1], {}, {"a": 1}]
 """Unexpected values."""
@@ -220,7 +220,11 @@ def test_names_are_shown_as_they_are_and_do_nothing(tmp_path: Path) -> None:
 
 
 def test_tasks_of_like_and_long_names_have_files_of_their_own() -> None:
-    names = page._file_names(["a/b", "a_b", "x" * 1000, "x" * 999 + "y", "a/b"])
+    tasks = ["a/b", "a_b", "x" * 1000, "x" * 999 + "y", "a/b"]
+    rows = [load.EvalRow(task, "pcil", "default", 1, 0, 0.0, 0.0, 0.0, None, "") for task in tasks]
+    found = list(figures._by_task(load.Collection(rows, [], {}, []), rows))
+    names = {task: name for task, name, _ in found}
+    assert [[row.task for row in mine] for *_, mine in found] == [["a/b"] * 2, *([task] for task in tasks[1:4])]
     assert len(names) == len(set(names.values())) == 4
     assert all(re.fullmatch(r"[\w-]{1,110}", name) for name in names.values()) and names["a/b"] == "a_b"
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import matplotlib.pyplot as plt
@@ -13,7 +14,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
-from pcil.report import figures
+from pcil.report import figures, tables
 from pcil.report.load import EvalRow, TransitionRow
 from pcil.training import presets
 
@@ -103,6 +104,12 @@ def test_axes_begin_at_zero_except_where_returns_are_below(run: Path, drawn: lis
     above, below = (axes.get_ylim() for axes in drawn)
     assert above[0] == 0 and above[1] > 200.5
     assert below[0] < -900 and below[1] > -150
+
+
+@pytest.mark.parametrize("make", figures.FIGURES)
+def test_every_kind_of_figure_has_a_heading_and_a_caption(make: Callable[..., Any]) -> None:
+    heading, caption = tables.title_and_caption(make)
+    assert 3 < len(heading) < 40 and caption.endswith(".") and len(caption) > 40
 
 
 def test_a_grid_is_a_png_a_pdf_and_svg(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def naive_probability(ours: list[np.ndarray], theirs: list[np.ndarray]) -> float
 
 def test_the_published_numbers() -> None:
     """Agarwal et al. 2021 test their library with these."""
-    assert stats.iqm_interval(list(RUNS_BY_TASKS.T)).value == 1.5
+    assert stats.interval(stats.iqm, list(RUNS_BY_TASKS.T)).value == 1.5
     assert stats.probability_of_improvement(list(RUNS_BY_TASKS.T), list(OTHERS.T)).value == pytest.approx(1 / 3)
 
 
@@ -101,7 +101,7 @@ def test_it_covers_the_truth_as_often_as_it_says() -> None:
 
 
 def test_one_seed_has_no_interval() -> None:
-    for interval in (stats.mean_interval([7.0]), stats.iqm_interval([np.array([7.0])])):
+    for interval in (stats.mean_interval([7.0]), stats.interval(stats.iqm, [np.array([7.0])])):
         assert interval.value == 7 and math.isnan(interval.low) and math.isnan(interval.high)
     alone = stats.probability_of_improvement([np.array([7.0])], [np.array([1.0, 2.0])])
     assert alone.value == 1 and math.isnan(alone.low)
@@ -120,7 +120,7 @@ def test_overlap() -> None:
 def test_the_bootstrap_draws_seeds_within_their_task() -> None:
     """Without strata the IQM of these would vary from 0 to 100."""
     apart = [np.zeros(5), np.full(5, 100.0)]
-    assert stats.iqm_interval(apart) == (50, 50, 50)
+    assert stats.interval(stats.iqm, apart) == (50, 50, 50)
 
 
 def test_the_bootstrap_is_that_of_all_possible_draws() -> None:
@@ -128,18 +128,18 @@ def test_the_bootstrap_is_that_of_all_possible_draws() -> None:
     strata = [np.array([1.0, 4.0, 10.0]), np.array([20.0, 50.0])]
     draws = itertools.product(itertools.product(strata[0], repeat=3), itertools.product(strata[1], repeat=2))
     exact = np.array([naive_iqm([*a, *b]) for a, b in draws])
-    value, low, high = stats.iqm_interval(strata)
+    value, low, high = stats.interval(stats.iqm, strata)
     assert value == pytest.approx(naive_iqm([1, 4, 10, 20, 50]))
     for end, level in ((low, 0.025), (high, 0.975)):  # up to the error of 2000 random draws of the 108
         assert np.mean(exact < end - 1e-9) - 0.01 < level < np.mean(exact <= end + 1e-9) + 0.01
-    assert stats.iqm_interval(strata) == stats.iqm_interval(strata), "the same numbers give the same interval"
+    assert stats.interval(stats.iqm, strata) == stats.interval(stats.iqm, strata), "the same numbers give the same interval"
 
 
 def test_each_column_of_a_curve_has_its_own_interval() -> None:
     strata = [np.random.default_rng(i).normal(size=(4, 6)) for i in range(3)]
     low, high = stats.bootstrap(stats.iqm, strata)
     for k in range(6):
-        alone = stats.iqm_interval([x[:, k] for x in strata])
+        alone = stats.interval(stats.iqm, [x[:, k] for x in strata])
         assert (low[k], high[k]) == pytest.approx(alone[1:], abs=0.05)
         assert alone.value == pytest.approx(stats.iqm(*strata)[k])
     assert all(np.isnan(end).all() and end.shape == (6,) for end in stats.bootstrap(stats.iqm, [strata[0], strata[1][:1]]))

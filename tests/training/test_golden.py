@@ -5,6 +5,7 @@ Run `make_golden.py` to update `golden.json` after a change that is meant to cha
 
 from __future__ import annotations
 
+import itertools
 import json
 from typing import Any
 
@@ -61,7 +62,10 @@ def test_defaults_stay_what_old_run_folders_mean_by_them() -> None:
 
 SPEC = Spec(24, 6, 2)
 """The sizes of walker_walk."""
-PRESETS = {(method, preset): presets.make("walker_walk", method, preset) for method, preset in presets.METHOD_SETTINGS}
+PRESETS = {
+    (method, preset): presets.make("walker_walk", method, preset)
+    for method, preset in itertools.product(presets.METHODS, presets.PRESETS)
+}
 DIFFERENT: dict[Algorithm, str] = {run.learner: " ".join(names) for names, run in PRESETS.items()}
 """Runs whose compiled functions differ; three presets of the expert with two different agents count as two, for example."""
 

@@ -75,7 +75,7 @@ class BC(Agent):
         obs = scaled(state.scaler, window.obs[:, 0])
         (loss, metrics), gradient = gradient_of(state.actor, obs, window.action[:, 0])
         actor, opt_state = adam_step(state.actor, gradient, state.opt_state, self.learning_rate)
-        return BCState(actor, opt_state, state.scaler), {"loss": loss, **metrics}
+        return dataclasses.replace(state, actor=actor, opt_state=opt_state), {"loss": loss, **metrics}
 
     def actor(self, state: BCState) -> Actor:
         return Actor(self.trunk(state, "actor"), state.actor.head)

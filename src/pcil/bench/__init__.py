@@ -43,25 +43,22 @@ def measure(task: str, preset: str, seconds: float) -> dict[str, float]:
     use_one_thread()
     from pcil import compilation, envs, modules
     from pcil.bench.environment import measure_env
-    from pcil.training import presets
+    from pcil.training import learner, presets
 
     compilation.start()
-    timing = measure_env(task)
+    environment = measure_env(task)
     modules.admit("The command", modules.of_task(task), None)
-    imitation, alone = (presets.make(task, method, preset) for method in ("pcil", "expert"))
-    with envs.opened(imitation.task) as env:
+    with envs.opened(task) as env:
         spec = envs.spec(env)
-    parts = {}
-    for name, run in (("", imitation), ("agent_", alone)):
-        setup = Setup(run, spec)
-        parts[f"{name}update_ms"] = setup.update
-        parts[f"{name}floor_ms"] = setup.floor
-    setup = Setup(imitation, spec)
-    parts |= {"act_us": setup.act, "sample_us": setup.sample}
-    figures = medians(parts, seconds / 2)
-    figures |= {name: timing[name] for name in ("env_step_us", "physics_us")}
-    share, speed = loop_share(imitation, seconds / 2)
-    return {name: float({**figures, "loop_update_share": share, "frames_per_second": speed}[name]) for name in KEYS}
+    imitation, alone = (Setup(presets.make(task, method, preset), spec) for method in ("pcil", "expert"))
+    parts = {"update_ms": imitation.update, "floor_ms": imitation.floor}
+    parts |= {"agent_update_ms": alone.update, "agent_floor_ms": alone.floor}
+    parts |= {"act_us": imitation.act, "sample_us": imitation.sample}
+    figures = environment | medians(parts, seconds / 2)
+    loop = time_loop(imitation.run, seconds / 2, [(learner, "update")])
+    figures["loop_update_share"] = loop.inside["update"] / loop.seconds
+    figures["frames_per_second"] = loop.frames / loop.seconds
+    return {name: float(figures[name]) for name in KEYS}
 
 
 def table(figures: dict[str, float]) -> str:
@@ -194,14 +191,6 @@ def medians(parts: dict[str, Callable[[int], None]], seconds: float) -> dict[str
             part(times[name])
             blocks[name].append((time.perf_counter() - start) / times[name] * units[name])
     return {name: statistics.median(values) for name, values in blocks.items()}
-
-
-def loop_share(run: Any, seconds: float) -> tuple[float, float]:
-    """The fraction of the training loop's time that is spent in the update, and the frames per second."""
-    from pcil.training import learner
-
-    timing = time_loop(run, seconds, [(learner, "update")])
-    return timing.inside["update"] / timing.seconds, timing.frames / timing.seconds
 
 
 class Timing(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pcil.envs import Checked, opened, spec
-from pcil.envs.dmc import DMCEnv
+from pcil.envs.dmc import DMCEnv, control_step
 from pcil.errors import InputError
 
 _BLOCK = 50
@@ -56,22 +56,15 @@ def _microseconds(run: Callable[[], None]) -> float:
 def _bare_physics(env: DMCEnv) -> Callable[[list[np.ndarray]], None]:
     """A function that makes MuJoCo's calls of consecutive agent steps on a copy of the environment's current state."""
     mujoco: Any = importlib.import_module("mujoco")
-    model, repeat = env.physics.model.ptr, range(env.action_repeat)
+    model = env.physics.model.ptr
     data = mujoco.MjData(model)
     mujoco.mj_copyData(data, model, env.physics.data.ptr)
-    substeps, runge_kutta = env.num_substeps, model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    step = control_step(model, data, env.num_substeps)
 
     def run(controls: list[np.ndarray]) -> None:
-        signal = data.ctrl
         for control in controls:
-            signal[:] = control
-            for _ in repeat:
-                if runge_kutta:
-                    mujoco.mj_step(model, data, substeps)
-                else:
-                    mujoco.mj_step2(model, data)
-                    if substeps > 1:
-                        mujoco.mj_step(model, data, substeps - 1)
-                mujoco.mj_step1(model, data)
+            data.ctrl[:] = control
+            for _ in range(env.action_repeat):
+                step()
 
     return run

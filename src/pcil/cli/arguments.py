@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
+
 from pcil.errors import InputError, brief
 from pcil.modules import Trust
 
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 
 Execute = Callable[..., int]
 """`(run, folder, callbacks) -> exit code`. The types are not spelled out, because `tyro` would have to resolve them here."""
+Json = Annotated[bool, tyro.conf.arg(name="json")]
+"""The option of commands that can print one JSON object or list and nothing else."""
 SEVERAL = ("callbacks",)
 """The options of `pcil train` that take several values."""
 
@@ -28,7 +32,6 @@ def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
     `tyro` prints errors in a box on standard error and exits. Standard error is captured only during parsing, not while
     `function` runs.
     """
-    import tyro
 
     @functools.wraps(function)
     def bind(*positional: Any, **named: Any) -> Callable[[], int]:
@@ -49,8 +52,6 @@ def call(name: str, function: Callable[..., int], argv: list[str]) -> int:
 
 def train(argv: list[str], execute: Execute) -> int:
     """Call `execute` with the run, the folder and the callbacks from the arguments of `pcil train`."""
-    import tyro
-
     from pcil import envs, modules
     from pcil.training import presets
     from pcil.training.config import REGISTRIES, Run

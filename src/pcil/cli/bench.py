@@ -1,11 +1,9 @@
 """`pcil bench`."""
 
 import json
-from typing import Annotated
-
-import tyro
 
 from pcil.cli import arguments
+from pcil.cli.arguments import Json
 from pcil.errors import InputError
 
 
@@ -13,7 +11,7 @@ def bench(
     task: str = "walker_walk",
     preset: str = "default",
     seconds: float = 20.0,
-    json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    json_output: Json = False,
 ) -> int:
     """Measure the speed of each part, and its ratio to a lower bound, on one thread.
 

@@ -1,14 +1,12 @@
 """`pcil demos`."""
 
 import json
-from typing import Annotated
-
-import tyro
 
 from pcil.cli import arguments
+from pcil.cli.arguments import Json
 
 
-def demos(json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+def demos(json_output: Json = False) -> int:
     """List the demonstrations that ship.
 
     Args:

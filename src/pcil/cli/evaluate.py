@@ -4,11 +4,9 @@ import contextlib
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from pcil.cli import arguments
+from pcil.cli.arguments import Json
 from pcil.errors import shown
 from pcil.modules import Trust
 from pcil.training.config import EnvKwargs
@@ -22,7 +20,7 @@ def evaluate(
     env_kwargs: EnvKwargs | None = None,
     single_environment: bool = False,
     trust: Trust = (),
-    json_output: Annotated[bool, tyro.conf.arg(name="json")] = False,
+    json_output: Json = False,
 ) -> int:
     """Roll out the policy of a run, without exploration.
 

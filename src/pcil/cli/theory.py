@@ -3,15 +3,13 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from pcil.cli import arguments
+from pcil.cli.arguments import Json
 from pcil.errors import shown
 
 
-def theory(out: Path | None = None, seed: int = 0, json_output: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+def theory(out: Path | None = None, seed: int = 0, json_output: Json = False) -> int:
     """Check the paper's Theorem 1 numerically, and draw it.
 
     Args:

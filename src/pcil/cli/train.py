@@ -50,8 +50,7 @@ def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
 def _shipped_return(run: "Run") -> float | None:
     """The mean return of the shipped demonstrations of the task, if the run itself does not need demonstrations."""
     from pcil import envs
-    from pcil.demos import shipped
+    from pcil.demos import Demonstrations, shipped_tasks
 
-    if run.needs_demos:
-        return None
-    return {row["task"]: row["return_mean"] for row in shipped()}.get(envs.task_name(run.task))
+    task = envs.task_name(run.task)
+    return None if run.needs_demos or task not in shipped_tasks() else Demonstrations.load(task).return_mean

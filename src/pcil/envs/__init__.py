@@ -118,7 +118,7 @@ def opened(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, A
     try:
         yield env
     finally:
-        if env is not task and not isinstance(task, gymnasium.Env):
+        if not isinstance(task, gymnasium.Env):
             env.close()
 
 

@@ -265,14 +265,26 @@ def advance_function(physics: Any, task: Any, num_substeps: int) -> Callable[[np
 
 
 def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], None]:
-    mujoco: Any = importlib.import_module("mujoco")
-    model, data = physics.model.ptr, physics.data.ptr
+    data = physics.data.ptr
     control_signal, warnings, before = data.ctrl, data.warning.number, data.warning.number.tobytes()
-    runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    mj_step, mj_step1, mj_step2 = mujoco.mj_step, mujoco.mj_step1, mujoco.mj_step2
+    step = control_step(physics.model.ptr, data, num_substeps)
 
     def advance(control: np.ndarray) -> None:
         control_signal[:] = control
+        step()
+        if warnings.tobytes() != before:
+            _raise_physics_error(warnings > np.frombuffer(before, warnings.dtype))
+
+    return advance
+
+
+def control_step(model: Any, data: Any, num_substeps: int) -> Callable[[], None]:
+    """A function that makes MuJoCo's calls of one control step."""
+    mujoco: Any = importlib.import_module("mujoco")
+    runge_kutta = model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    mj_step, mj_step1, mj_step2 = mujoco.mj_step, mujoco.mj_step1, mujoco.mj_step2
+
+    def step() -> None:
         if runge_kutta:
             mj_step(model, data, num_substeps)
         else:
@@ -280,10 +292,8 @@ def _plain_advance(physics: Any, num_substeps: int) -> Callable[[np.ndarray], No
             if num_substeps > 1:
                 mj_step(model, data, num_substeps - 1)
         mj_step1(model, data)  # updates positions and velocities to the new state
-        if warnings.tobytes() != before:
-            _raise_physics_error(warnings > np.frombuffer(before, warnings.dtype))
 
-    return advance
+    return step
 
 
 def _raise_physics_error(raised: np.ndarray) -> None:

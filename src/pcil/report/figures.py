@@ -1,4 +1,4 @@
-"""Figures of learning curves and of representations, drawn from rows of results and written as PNG and PDF."""
+"""Figures of a set of runs, written as PNG and PDF. The docstring of a maker is the heading and the caption of its figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import itertools
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from pcil.errors import shown
 from pcil.report import stats
-from pcil.report.load import OFFLINE, EvalRow, TransitionRow, by_variant, label, matrix, read_run
+from pcil.report.load import OFFLINE, Collection, EvalRow, Row, TransitionRow, by_variant, label, matrix, read_run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -90,6 +90,44 @@ def assign_styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, st
     return found
 
 
+def learning_curves(found: Collection, folder: Path) -> dict[str, str]:
+    """Learning curves: the mean over seeds with Student's 95% interval as a band, and each seed as a thin line.
+
+    The last figure has interquartile means over each method's own tasks, with a bootstrap interval as a band. A method that
+    takes no step in the environment is a horizontal line. Click a figure to enlarge it, and again to close it.
+    """
+    styles = assign_styles(found.rows)
+    grid(found.rows, folder / "curves", styles=styles)  # all tasks on one sheet, as papers print it
+    drawn = {task: grid(rows, folder / f"curves-{file}", styles=styles) for task, file, rows in _by_task(found, found.rows)}
+    together = aggregate(found.rows, folder / "aggregate", styles)
+    return drawn | ({"all tasks": together} if together else {})
+
+
+def reward_health(found: Collection, folder: Path) -> dict[str, str]:
+    """Reward health: correlation of the learned with the true reward over the steps of an episode.
+
+    It is averaged between evaluations.
+    """
+    if all(row.correlation is None for row in found.rows):
+        return {}
+    return {"all": grid(found.rows, folder / "health", value="correlation")}
+
+
+def t_sne(found: Collection, folder: Path) -> dict[str, str]:
+    """t-SNE: 128 transitions of the expert (blue) and 256 of one episode of the agent.
+
+    They are those of the first seed, the agent's coloured by their true reward.
+    """
+    if found.transitions:
+        scatter_grid(found.transitions, folder / "representation")
+    tasks = _by_task(found, found.transitions)
+    return {task: scatter_grid(rows, folder / f"representation-{file}", columns=2) for task, file, rows in tasks}
+
+
+FIGURES: list[Callable[[Collection, Path], dict[str, str]]] = [learning_curves, reward_health, t_sne]
+"""What draws each kind of figure of a report into a folder; those of the page are returned as SVG, by title."""
+
+
 def run_curve(folder: Path, expert_return: float | None) -> Path:
     """Draw one run's learning curve as `curve.png` in its folder, and return that path."""
     rows = read_run(folder)
@@ -133,7 +171,7 @@ def grid(
         for name in (name for name in styles if (task, *name) in groups):
             runs, text = groups[task, *name], escape_label(label(name, styles))
             if name[0] in OFFLINE:
-                _level_line(axis, matrix(runs, value)[1][:, -1].mean(), styles[name], text)
+                axis.axhline(matrix(runs, value)[1][:, -1].mean(), label=text, **styles[name].line)
             else:
                 _seed_lines(axis, runs, value, styles[name], text)
         if value == "return_mean":
@@ -167,7 +205,7 @@ def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str],
         if len({len(tasks) for tasks in strata.values()}) > 1:
             text += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
         if name[0] in OFFLINE:
-            _level_line(axis, center[-1], styles[name], text)
+            axis.axhline(center[-1], label=text, **styles[name].line)
         else:
             _band_line(axis, frames, center, stats.bootstrap(stats.iqm, scores), styles[name], text)
         drawn += center.tolist()
@@ -209,6 +247,16 @@ def save(figure: Figure, path: Path) -> str:
     return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text.getvalue())  # 0.01 pt is enough
 
 
+def _by_task(found: Collection, rows: Sequence[Row]) -> Iterator[tuple[str, str, list[Row]]]:
+    """Each task of the rows, a part of a file name that no other task has, and the rows of the task."""
+    names: dict[str, str] = {}
+    for task in dict.fromkeys(row.task for row in (*found.rows, *found.transitions)):
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", task)[:100]
+        names[task] = f"{name}_{len(names)}" if name in names.values() else name
+    for task in dict.fromkeys(row.task for row in rows):
+        yield task, names[task], [row for row in rows if row.task == task]
+
+
 def _write(figure: Figure, file: Path | io.StringIO, **options: Any) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph")  # a name may have letters that the font lacks
@@ -236,11 +284,6 @@ def _seed_lines(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style
     if len(frames):
         center, *bounds = np.array([stats.mean_interval(column) for column in values.T]).T
         _band_line(axis, frames, center, bounds, style, name)
-
-
-def _level_line(axis: Axes, value: float, style: Style, label: str) -> None:
-    """Draw a horizontal line for a method that takes no step in the environment."""
-    axis.axhline(value, label=label, **style.line)
 
 
 def _band_line(

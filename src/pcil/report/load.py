@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 
 from pcil.errors import InputError, brief, shown
-from pcil.files import flat, parse_json, read_json, read_text
+from pcil.files import flat, parse_json, read_json, read_text, write_text
 from pcil.report.variants import MAX_NAME_LENGTH, variants
 
 OFFLINE = ("bc",)
@@ -276,11 +276,10 @@ def escape_formula(text: str) -> str:
 
 def write_csv(path: Path, lines: Iterable[Iterable[Any]]) -> None:
     """Write a CSV file completely or not at all, with formulas escaped."""
-    partial = path.with_name(f"{path.name}.tmp")
-    with partial.open("w", newline="", encoding="utf-8") as file:
-        escaped = ([escape_formula(value) if isinstance(value, str) else value for value in line] for line in lines)
-        csv.writer(file, lineterminator="\n").writerows(escaped)
-    partial.replace(path)
+    text = io.StringIO()
+    escaped = ([escape_formula(value) if isinstance(value, str) else value for value in line] for line in lines)
+    csv.writer(text, lineterminator="\n").writerows(escaped)
+    write_text(path, text.getvalue())
 
 
 def write_rows(path: Path, rows: Sequence[EvalRow] | Sequence[TransitionRow]) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import base64
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from jinja2 import Environment
@@ -46,6 +45,11 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     write_rows(out / "tables" / "evaluations.csv", found.rows)
     if found.transitions:
         write_rows(out / "tables" / "transitions.csv", found.transitions)
+    drawn = {
+        tables.title_and_caption(make): {title: _uri("svg+xml", svg.encode()) for title, svg in pictures.items()}
+        for make in figures.FIGURES
+        if (pictures := make(found, out / "figures"))
+    }
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"cell": tables.cell, "shown": lambda value: shown(str(value), 500)}
     page = environment.from_string(Path(__file__).with_name("page.html").read_text()).render(
@@ -54,41 +58,11 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
         found=found,
         last={row[:4]: row for row in found.rows},
         tables=[(name, *tables.title_and_caption(tables.MAKERS[name]), table) for name, table in written.items()],
-        figures=draw(found, out / "figures"),
+        figures=drawn,
         films={title: _uri("webp", film) for title, film in films.items()},
     )
     (out / "index.html").write_text(page, encoding="utf-8")
     return out / "index.html"
-
-
-def draw(found: Collection, folder: Path) -> dict[str, dict[str, str]]:
-    """Write every figure to `folder`; return those of the page as data URIs, by heading and then by title."""
-    rows, styles = found.rows, figures.assign_styles(found.rows)
-    files = _file_names([row.task for row in (*rows, *found.transitions)])
-    svg: dict[str, dict[str, str]] = {"Learning curves": {}}
-    figures.grid(rows, folder / "curves", styles=styles)  # all tasks on one sheet, as papers print it
-    for task in dict.fromkeys(row.task for row in rows):
-        path = folder / f"curves-{files[task]}"
-        svg["Learning curves"][task] = figures.grid([row for row in rows if row.task == task], path, styles=styles)
-    if together := figures.aggregate(rows, folder / "aggregate", styles):
-        svg["Learning curves"]["all tasks"] = together
-    if any(row.correlation is not None for row in rows):
-        svg["Reward health"] = {"all": figures.grid(rows, folder / "health", value="correlation", styles=styles)}
-    if found.transitions:
-        figures.scatter_grid(found.transitions, folder / "representation")
-    for task in dict.fromkeys(row.task for row in found.transitions):
-        path, mine = folder / f"representation-{files[task]}", [row for row in found.transitions if row.task == task]
-        svg.setdefault("t-SNE", {})[task] = figures.scatter_grid(mine, path, columns=2)
-    return {heading: {title: _uri("svg+xml", t.encode()) for title, t in drawn.items()} for heading, drawn in svg.items()}
-
-
-def _file_names(tasks: Iterable[str]) -> dict[str, str]:
-    """A unique part of a file name for each task."""
-    names: dict[str, str] = {}
-    for task in dict.fromkeys(tasks):
-        name = re.sub(r"[^A-Za-z0-9_-]", "_", task)[:100]
-        names[task] = f"{name}_{len(names)}" if name in names.values() else name
-    return names
 
 
 def _uri(kind: str, data: bytes) -> str:

@@ -50,9 +50,9 @@ def iqm(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
     return np.asarray(stats.trim_mean(np.concatenate(strata, axis=axis), 0.25, axis=axis))
 
 
-def iqm_interval(strata: Sequence[np.ndarray]) -> Interval:
-    """The IQM of final scores `[seeds]`, with its bootstrap interval."""
-    return Interval(float(iqm(*strata)), *map(float, bootstrap(iqm, strata)))
+def interval(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> Interval:
+    """`statistic(*strata)` of final scores `[seeds]`, with its bootstrap interval."""
+    return Interval(float(statistic(*strata)), *map(float, bootstrap(statistic, strata)))
 
 
 def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]) -> Interval:
@@ -64,8 +64,7 @@ def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.n
         wins = [(1 + np.sign(x[..., :, None] - y[..., None, :])).mean(axis=(-2, -1)) / 2 for x, y in pairs]
         return np.asarray(np.mean(wins, axis=0))
 
-    both = [*ours, *theirs]
-    return Interval(float(chance(*both)), *map(float, bootstrap(chance, both)))
+    return interval(chance, [*ours, *theirs])
 
 
 def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

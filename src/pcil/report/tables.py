@@ -49,7 +49,7 @@ def finals(found: Collection) -> Table:
         share = stats.share_of_expert(runs, final)
         deviation = float(np.std(final, ddof=1)) if len(final) > 1 else None
         expert = runs[0][-1].expert_return, None if share is None else float(share.mean())
-        ours = stats.mean_interval(final), deviation, stats.iqm_interval([final])
+        ours = stats.mean_interval(final), deviation, stats.interval(stats.iqm, [final])
         rows.append((*name, *ours, *expert, len(final), frames))
     return Table((*KEY, "mean", "sd", "IQM", "expert", "of expert", "seeds", "frames"), rows)
 
@@ -106,9 +106,8 @@ def aggregate(found: Collection) -> Table:
         shares = (stats.share_of_expert(runs, _final(runs)[1]) for runs in tasks.values())
         if not (scores := [share for share in shares if share is not None]):
             continue
-        ends = map(float, stats.bootstrap(_mean_of_tasks, scores))
-        mean = Interval(float(_mean_of_tasks(*scores)), *ends)
-        rows.append((*name, mean, stats.iqm_interval(scores), len(scores), sum(map(len, scores))))
+        mean, iqm = (stats.interval(statistic, scores) for statistic in (_mean_of_tasks, stats.iqm))
+        rows.append((*name, mean, iqm, len(scores), sum(map(len, scores))))
     return Table(("method", "variant", "mean", "IQM", "tasks", "runs"), rows)
 
 
@@ -186,8 +185,8 @@ MAKERS: dict[str, Maker] = {
 }
 
 
-def title_and_caption(make: Maker) -> tuple[str, str]:
-    """The title and the caption of a maker's table."""
+def title_and_caption(make: Callable[..., Any]) -> tuple[str, str]:
+    """The title and the caption of what a maker of tables or figures makes."""
     title, _, caption = " ".join((make.__doc__ or "").split()).partition(": ")
     return title, caption[:1].upper() + caption[1:]
 

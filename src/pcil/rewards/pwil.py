@@ -7,7 +7,7 @@ Dadashi et al. 2021, and in the form of the authors' code (agent/pwil.py) on slo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, sqrt
 from typing import Any, ClassVar, Literal
 
@@ -125,8 +125,7 @@ class PWIL(Reward):
         self, state: PWILState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[PWILState, Metrics]:
         del expert, agent, key
-        slow = state.slow and state.slow.update(embed, self.refresh)
-        return PWILState(state.atoms, state.mean, state.deviation, state.horizon, slow), {}
+        return replace(state, slow=state.slow and state.slow.update(embed, self.refresh)), {}
 
     def reward(self, state: PWILState, batch: Batch, embed: Embed, *, key: PRNGKeyArray) -> Float[Array, " T"]:
         """A step has `1 / horizon` of the mass, so `sigma c` is `beta / sqrt(dimensions)` times the mean distance it moves."""

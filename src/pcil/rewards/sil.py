@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any, ClassVar, Literal
 
@@ -113,7 +113,7 @@ class SinkhornReward(Reward):
             return -self.first_sum / jnp.maximum(total, 1e-6)
 
         scale = jax.lax.cond(state.scale > 0, lambda: state.scale, by_this_episode)
-        return SinkhornState(state.demos, scale, state.space)
+        return replace(state, scale=scale)
 
 
 class Adversary(eqx.Module):
@@ -178,8 +178,8 @@ class SIL(SinkhornReward):
             return Adversary(critic, opt_state, -loss, old.updates)
 
         new = jax.lax.cond(old.updates % self.every == 0, learn, lambda: old)
-        new = Adversary(new.critic, new.opt_state, new.cost, old.updates + 1)
-        return SinkhornState(state.demos, state.scale, new), {"transport_cost": new.cost}
+        new = replace(new, updates=old.updates + 1)
+        return replace(state, space=new), {"transport_cost": new.cost}
 
     def costs(self, state: SinkhornState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
         demo = state.demos[jax.random.randint(key, (), 0, len(state.demos.weight))]
@@ -212,7 +212,7 @@ class POTIL(SinkhornReward):
         self, state: SinkhornState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray
     ) -> tuple[SinkhornState, Metrics]:
         del expert, agent, key
-        return SinkhornState(state.demos, state.scale, state.space.update(embed, self.refresh)), {}
+        return replace(state, space=state.space.update(embed, self.refresh)), {}
 
     def costs(self, state: SinkhornState, batch: Batch, embed: Embed, *, key: Any) -> Float[Array, " T"]:
         del embed, key

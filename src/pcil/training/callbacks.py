@@ -149,13 +149,13 @@ class LogFiles(Callback):
             self._files["eval.csv"].seek(0)
             held.clear()
             self._write("eval.csv", ",".join([*EVAL_COLUMNS, "success"]) + "\n")
-        columns = [range(len(result.returns)), map(repr, result.returns.tolist()), result.lengths.tolist()]
-        columns += [[f"{seconds:.1f}"] * len(result.returns)]
-        if held[0].partition("\n")[0].endswith(",success"):
-            columns.append([f"{value:g}" for value in result.success or [float("nan")] * len(result.returns)])
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows((frames, *row) for row in zip(*columns, strict=True))
-        self._write("eval.csv", text.getvalue())
+        with_success = held[0].partition("\n")[0].endswith(",success")
+        success = result.success or [math.nan] * len(result.returns)
+        lines = []
+        for i, (paid, length, won) in enumerate(zip(result.returns.tolist(), result.lengths.tolist(), success, strict=True)):
+            cells = [frames, i, paid, length, f"{seconds:.1f}", *([f"{won:g}"] if with_success else [])]
+            lines.append(",".join(map(str, cells)) + "\n")
+        self._write("eval.csv", "".join(lines))
 
     def end(self) -> None:
         for file in self._files.values():
@@ -186,10 +186,8 @@ class TensorBoard(Callback):
             self.episode(row)
         for frames, group in itertools.groupby(history.evaluations, key=lambda row: row["frames"]):
             episodes = list(group)
-            for column in ("return", "success"):
-                if column in episodes[0]:
-                    mean = statistics.fmean(float(row[column]) for row in episodes)
-                    self._scalar(f"evaluation/{column}", mean, int(frames), float(episodes[0]["seconds"]))
+            columns = {name: [float(row[name]) for row in episodes if name in row] for name in ("return", "success")}
+            self._means(columns, int(frames), float(episodes[0]["seconds"]))
         self._writer.flush()
 
     def episode(self, row: dict[str, Any]) -> None:
@@ -198,14 +196,18 @@ class TensorBoard(Callback):
                 self._scalar(name if "/" in name else f"episode/{name}", value, row["frames"], row.get("seconds", 0.0))
 
     def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
-        seconds = float(f"{seconds:.1f}")  # as the logs have it
-        self._scalar("evaluation/return", statistics.fmean(result.returns.tolist()), frames, seconds)
-        if result.success:
-            self._scalar("evaluation/success", statistics.fmean(result.success), frames, seconds)
+        columns = {"return": result.returns.tolist(), "success": result.success or []}
+        self._means(columns, frames, float(f"{seconds:.1f}"))  # as the logs have it
         self._writer.flush()
 
     def end(self) -> None:
         self._writer.close()
+
+    def _means(self, columns: dict[str, list[float]], frames: int, seconds: float) -> None:
+        """The mean of each column of an evaluation that has values."""
+        for name, values in columns.items():
+            if values:
+                self._scalar(f"evaluation/{name}", statistics.fmean(values), frames, seconds)
 
     def _scalar(self, name: str, value: float, frames: int, seconds: float) -> None:
         from tensorboardX.summary import scalar

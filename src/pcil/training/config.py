@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -123,9 +124,6 @@ class Run:
             evaluate_every=(1, inf),
             evaluate_episodes=(1, inf),
             replay_steps=(1, inf),
-        )
-        check_ranges(
-            self,
             frames=(1, inf),
             seed=(0, 2**31 - 1),
             seed_frames=(0, inf),
@@ -140,7 +138,7 @@ class Run:
         """The settings that are compiled."""
         return Algorithm(self.agent, self.reward, self.label)
 
-    @property
+    @functools.cached_property
     def own_modules(self) -> tuple[str, ...]:
         """The modules of an agent and a reward that are none of ours, and that of such an agent's actor."""
         kinds = [type(self.agent), type(self.reward)]
@@ -181,26 +179,26 @@ class Run:
         Only agents and rewards of this package are created, and those in `classes`, by path; others raise `InputError`.
         """
         values = renamed(flat(settings))
-        kinds: dict[str, Any] = {}
+        parts: dict[str, Any] = {}
         for part, registry in REGISTRIES.items():
             name, known = values.pop(f"{part}.class"), {**registry, **(classes or {})}
             if name not in known:
                 raise InputError(
                     f"The {part} {brief(name)} is not part of this package, and code that files name is not run unasked."
                 )
-            kinds[part] = known[name]
-        own = {field.name for field in dataclasses.fields(cls)}
-        plain = {name: values.pop(name) for name in list(values) if name in own}
-        parts = {
-            part: _made(kind, {"absorbing": False} if part == "agent" else {}, part, values) for part, kind in kinds.items()
-        }
+            own, first = taken(values, part), {"absorbing": False} if part == "agent" else {}
+            for setting in dataclasses.fields(known[name]):
+                if setting.default is setting.default_factory is dataclasses.MISSING and setting.name in own:
+                    first[setting.name] = own[setting.name]
+            parts[part] = changed(known[name](**first), own)
+        names = {field.name for field in dataclasses.fields(cls)}
+        plain = {name: values.pop(name) for name in list(values) if name in names}
         return changed(cls(**plain, **parts), values)
 
 
-def _made(kind: type, first: dict[str, Any], part: str, values: dict[str, Any]) -> Any:
-    """An agent or a reward with the defaults of its class; fields without a default are taken from the values."""
-    needed = [field.name for field in dataclasses.fields(kind) if field.default is field.default_factory is dataclasses.MISSING]
-    return kind(**first, **{name: values[f"{part}.{name}"] for name in needed if f"{part}.{name}" in values})
+def taken(settings: dict[str, Any], part: str) -> dict[str, Any]:
+    """The settings of a part, which are taken out of flat `settings`."""
+    return {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
 
 
 RENAMED = {"agent.standardise": "agent.normalize_observations"}

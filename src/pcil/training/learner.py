@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil import seeds
 from pcil.agents import Actor
-from pcil.rewards import Embed, Reward, label
+from pcil.rewards import Embed, label
 from pcil.seeds import Stream
 from pcil.training.config import Algorithm
 from pcil.types import Batch, Episode, Spec, Window
@@ -49,10 +50,9 @@ def init(algorithm: Algorithm, spec: Spec, demos: Sequence[Batch], seed: int | A
     learner = Learner(agent, reward, root, {})
     window = _zeros(spec, algorithm.agent.batch_size, max(algorithm.agent.n_step, algorithm.reward.span))
     expert = _zeros(spec, algorithm.reward.batch_size, algorithm.reward.span)
-    traced = functools.partial(_step, algorithm)
-    metrics = jax.eval_shape(traced, learner, window, expert, expert, jnp.int32(0), jnp.int32(0))[1]
-    zeros = {name: jnp.zeros(()) for name in [*sorted(metrics.keys() - set(UNSAID)), "updates"]}
-    return eqx.tree_at(lambda s: s.totals, learner, zeros | {"finite": jnp.zeros(len(checks(metrics)))})
+    updated = functools.partial(_update, algorithm)
+    after, _ = jax.eval_shape(updated, learner, window, expert, expert, jnp.int32(0), jnp.int32(0))
+    return replace(learner, totals={name: jnp.zeros(total.shape) for name, total in after.totals.items()})
 
 
 def _zeros(spec: Spec, rows: int, n: int) -> Window:
@@ -67,8 +67,7 @@ def frozen_embed(algorithm: Algorithm, agent: Any) -> Embed:
     return jax.lax.stop_gradient(algorithm.agent.trunk(agent, algorithm.reward.trunk))
 
 
-@functools.partial(jax.jit, static_argnames="algorithm", donate_argnames="learner")
-def update(
+def _update(
     algorithm: Algorithm,
     learner: Learner,
     window: Window,
@@ -83,25 +82,6 @@ def update(
     those that are `longer` than `window`, if it needs such, else from the first rows of `window`, as in the authors' code. The
     second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
-    learner, metrics = _step(algorithm, learner, window, expert, longer, step, count)
-    actor, before = algorithm.agent.actor(learner.agent), learner.totals
-    metrics["actor"] = _largest(actor)
-    good = jnp.stack([jnp.isfinite(metrics[name]) for name in checks(metrics)])
-    totals = {name: before[name] + value for name, value in {**metrics, "updates": 1.0}.items() if name not in UNSAID}
-    totals["finite"] = before["finite"] + jnp.where(good & (before["finite"] == before["updates"]), 1.0, 0.0)
-    learner = eqx.tree_at(lambda s: s.totals, learner, totals)
-    return learner, jax.tree.map(jnp.copy, actor)
-
-
-def _step(
-    algorithm: Algorithm,
-    learner: Learner,
-    window: Window,
-    expert: Window | None,
-    longer: Window | None,
-    step: Array,
-    count: Array,
-) -> tuple[Learner, dict[str, Array]]:
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
     agent = algorithm.agent.observe(learner.agent, window.obs[:, 0])
@@ -119,7 +99,20 @@ def _step(
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
     metrics |= {name: _largest(tree) for name, tree in unsaid.items()}
-    return Learner(agent_state, reward_state, learner.root, learner.totals), metrics
+    actor = algorithm.agent.actor(agent_state)
+    metrics["actor"] = _largest(actor)
+    return Learner(agent_state, reward_state, learner.root, _added(learner.totals, metrics)), jax.tree.map(jnp.copy, actor)
+
+
+update = jax.jit(_update, static_argnames="algorithm", donate_argnames="learner")
+
+
+def _added(totals: dict[str, Array], metrics: dict[str, Array]) -> dict[str, Array]:
+    """The `totals` after one more update with these metrics; before the first one there may be none."""
+    good = jnp.stack([jnp.isfinite(metrics[name]) for name in checks(metrics)])
+    before = totals or dict.fromkeys([*metrics, "updates", "finite"], jnp.zeros(()))
+    after = {name: before[name] + value for name, value in {**metrics, "updates": 1.0}.items() if name not in UNSAID}
+    return after | {"finite": before["finite"] + jnp.where(good & (before["finite"] == before["updates"]), 1.0, 0.0)}
 
 
 def steps(window: Window) -> Batch:
@@ -173,10 +166,9 @@ def copied(learner: Learner) -> Learner:
 
 def close_episode(algorithm: Algorithm, learner: Learner, episode: Episode, count: int) -> Learner:
     """The learner at the end of an episode, before the episode is labelled: a reward of whole episodes may take note of it."""
-    if type(algorithm.reward).after_episode is Reward.after_episode:
+    if algorithm.reward.scope == "step":
         return learner
-    reward = _after_rows(algorithm, learner, *_padded(algorithm, episode)[:2], np.int32(count))
-    return Learner(learner.agent, reward, learner.root, learner.totals)
+    return replace(learner, reward=_after_rows(algorithm, learner, *_padded(algorithm, episode)[:2], np.int32(count)))
 
 
 @functools.partial(jax.jit, static_argnames="algorithm")

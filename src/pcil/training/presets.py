@@ -13,7 +13,7 @@ from typing import Any
 from pcil import modules
 from pcil.errors import InputError, brief
 from pcil.nets.noise import LinearSchedule
-from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed
+from pcil.training.config import REGISTRIES, Run, changed, part_of_run, renamed, taken
 
 
 def paper(task: str) -> dict[str, Any]:
@@ -56,19 +56,12 @@ def released(task: str) -> dict[str, Any]:
 
 
 def default(task: str) -> dict[str, Any]:
-    """What our measurements favour."""
-    del task
+    """What our measurements favour, and what the paper says elsewhere."""
     return {
+        **paper(task),
         "frames": 500_000,  # ours
         "label": "sampled",  # ours: stored rewards are stale
-        "seed_frames": 2000,  # authors' cfgs/config.yaml
         "random_frames": 2000,  # ours
-        "update_every": 2,  # paper Table
-        "replay_steps": 500_000,  # paper Table
-        "evaluate_every": 20_000,  # paper Figure 3
-        "evaluate_episodes": 10,  # paper Figure 3
-        "agent": "drqv2",  # paper section 4.1
-        "agent.batch_size": 128,  # paper Table
         "agent.n_step": 1,  # ours
         "agent.learning_rate": 5e-4,  # ours
         "agent.normalize_observations": True,  # ours: experts learn several times faster
@@ -94,7 +87,6 @@ BC_SETTINGS: dict[str, Any] = {
 PWIL_AS_RELEASED: dict[str, Any] = {
     "random_frames": 4000,  # authors' cfgs: 2000 agent steps
     "agent.noise": LinearSchedule(0.1, 0.1, 1),  # authors' cfgs: a constant 0.1
-    "reward": "pwil",
     "reward.inputs": "trunk",  # authors' agent/pwil.py
     "reward.alpha": 5.0,  # authors' agent/pwil.py
     "reward.beta": 5.0,  # authors' agent/pwil.py
@@ -115,94 +107,76 @@ EASY = ("finger_spin", "hopper_stand", "pendulum_swingup", "walker_stand", "walk
 def bc_as_released(task: str) -> dict[str, Any]:
     """BC with the batch of the task."""
     batch = 256 if task.startswith("walker") else 128  # authors' agent/bc.py: batch_size // bz_ratio
-    return {**BC_SETTINGS, "agent.batch_size": batch, "agent.hidden": 1024}  # authors' agent/bc.py, dmc.yaml
+    return {"agent.batch_size": batch, "agent.hidden": 1024}  # authors' agent/bc.py, dmc.yaml
 
 
 def expert_as_released(task: str) -> dict[str, Any]:
     """DrQ-v2 on the task's reward, with the frames and the exploration of its group of tasks."""
+    frames, steps = (1_100_000, 100_000) if task in EASY else (3_100_000, 500_000)  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
     return {
-        "frames": 1_100_000 if task in EASY else 3_100_000,  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
+        "frames": frames,
         "random_frames": 4000,  # DrQ-v2 cfgs/config.yaml: 2000 agent steps
-        "agent.noise": LinearSchedule(
-            1.0, 0.1, 100_000 if task in EASY else 500_000
-        ),  # DrQ-v2 cfgs/task/easy.yaml, medium.yaml
-        "reward": "expert",
+        "agent.noise": LinearSchedule(1.0, 0.1, steps),
     }
 
 
-METHOD_SETTINGS: dict[tuple[str, str], dict[str, Any] | Callable[[str], dict[str, Any]]] = {
-    ("pcil", "paper"): {"reward": "pcil", "reward.temperature": 0.07},  # paper Table
-    ("pcil", "released"): {
-        "reward": "pcil",
-        "reward.temperature": 1.0,
-        "reward.hidden": 1024,
-    },  # authors' pcil.py: T is never applied; dmc.yaml
-    ("pcil", "default"): {
-        "reward": "pcil",
-        "reward.temperature": 1.0,
-        "reward.learning_rate": 5e-4,
-    },  # ours: 0.07 does not learn
-    ("dac", "paper"): {"reward": "dac"},  # authors' agent/dac.py
-    ("dac", "released"): {"reward": "dac", "reward.hidden": 1024},  # authors' agent/dac.py, dmc.yaml
-    ("dac", "default"): {"reward": "dac", "reward.learning_rate": 5e-4},  # ours
-    ("pwil", "paper"): {"reward": "pwil"},  # Dadashi et al. 2021, on all states
-    ("pwil", "released"): PWIL_AS_RELEASED,
-    ("pwil", "default"): {"reward": "pwil", "label": "stored"},  # as paper
-    ("sil", "paper"): {
-        "reward": "sil",
-        "reward.learning_rate": 1e-4,
-    },  # paper Table; otherwise Papagiannis and Li 2020: no text for SIL
-    ("sil", "released"): {"reward": "sil", **SIL_AS_RELEASED},  # Papagiannis and Li 2020: the release has POTIL alone
-    ("sil", "default"): {
-        "reward": "sil",
-        "reward.every": 1000,
-        "label": "stored",
-    },  # ours: a faster critic leaves nothing to learn
-    ("potil", "paper"): {"reward": "potil"},  # authors' agent/potil.py: no text for it
-    ("potil", "released"): {"reward": "potil", **SIL_AS_RELEASED, "reward.batch_size": 0},  # authors' agent/potil.py
-    ("potil", "default"): {"reward": "potil", "label": "stored"},  # as paper
-    ("tcn", "paper"): {"reward": "tcn", "reward.temperature": 0.07},  # paper Appendix C
-    ("tcn", "released"): {
-        "reward": "tcn",
-        "reward.temperature": 0.07,
-        "reward.hidden": 1024,
-    },  # not in the release: Appendix C; size of dmc.yaml
-    ("tcn", "default"): {"reward": "tcn", "reward.temperature": 0.07, "reward.learning_rate": 5e-4},  # Appendix C; rate: ours
-    ("pcil-gail", "paper"): {"reward": "pcil", "reward.temperature": 0.07, "reward.head": "gail"},  # paper Appendix C
-    ("pcil-gail", "released"): {
-        "reward": "pcil",
-        "reward.temperature": 1.0,
-        "reward.hidden": 1024,
-        "reward.head": "gail",
-    },  # head not in the release; as pcil
-    ("pcil-gail", "default"): {
-        "reward": "pcil",
-        "reward.temperature": 1.0,
-        "reward.learning_rate": 5e-4,
-        "reward.head": "gail",
-    },  # as pcil
-    ("tcn-gail", "paper"): {"reward": "tcn", "reward.temperature": 0.07, "reward.head": "gail"},  # paper Appendix C
-    ("tcn-gail", "released"): {
-        "reward": "tcn",
-        "reward.temperature": 0.07,
-        "reward.hidden": 1024,
-        "reward.head": "gail",
-    },  # not in the release; as tcn
-    ("tcn-gail", "default"): {
-        "reward": "tcn",
-        "reward.temperature": 0.07,
-        "reward.learning_rate": 5e-4,
-        "reward.head": "gail",
-    },  # as tcn
-    ("bc", "paper"): {**BC_SETTINGS},  # authors' agent/bc.py; width of the paper's Table
-    ("bc", "released"): bc_as_released,
-    ("bc", "default"): {**BC_SETTINGS},  # as paper; scaled observations: ours
-    ("expert", "paper"): {"reward": "expert"},
-    ("expert", "released"): expert_as_released,
-    ("expert", "default"): {"reward": "expert"},
+Settings = dict[str, Any] | Callable[[str], dict[str, Any]]
+"""Settings by dotted names, or a function that gives them for a task."""
+
+PCIL_SETTINGS: dict[str, Settings] = {
+    "every preset": {"reward": "pcil"},
+    "paper": {"reward.temperature": 0.07},  # paper Table
+    "released": {"reward.temperature": 1.0, "reward.hidden": 1024},  # authors' pcil.py: T is never applied; dmc.yaml
+    "default": {"reward.temperature": 1.0, "reward.learning_rate": 5e-4},  # ours: 0.07 does not learn
 }
-"""What a method changes of a preset, for some methods by task; dotted names are settings of the agent or the reward."""
-METHODS = tuple(dict.fromkeys(method for method, _ in METHOD_SETTINGS))
+
+TCN_SETTINGS: dict[str, Settings] = {
+    "every preset": {"reward": "tcn", "reward.temperature": 0.07},  # paper Appendix C
+    "released": {"reward.hidden": 1024},  # not in the release; size of dmc.yaml
+    "default": {"reward.learning_rate": 5e-4},  # ours
+}
+
+METHOD_SETTINGS: dict[str, dict[str, Settings]] = {
+    "pcil": PCIL_SETTINGS,
+    "dac": {
+        "every preset": {"reward": "dac"},  # authors' agent/dac.py
+        "released": {"reward.hidden": 1024},  # authors' cfgs/suite/dmc.yaml
+        "default": {"reward.learning_rate": 5e-4},  # ours
+    },
+    "pwil": {
+        "every preset": {"reward": "pwil"},  # Dadashi et al. 2021, on all states
+        "released": PWIL_AS_RELEASED,
+        "default": {"label": "stored"},  # as paper
+    },
+    "sil": {
+        "every preset": {"reward": "sil"},  # Papagiannis and Li 2020: no text for it, and the release has POTIL alone
+        "paper": {"reward.learning_rate": 1e-4},  # paper Table
+        "released": SIL_AS_RELEASED,
+        "default": {"reward.every": 1000, "label": "stored"},  # ours: a faster critic leaves nothing to learn
+    },
+    "potil": {
+        "every preset": {"reward": "potil"},  # authors' agent/potil.py: no text for it
+        "released": {**SIL_AS_RELEASED, "reward.batch_size": 0},  # authors' agent/potil.py
+        "default": {"label": "stored"},  # as paper
+    },
+    "tcn": TCN_SETTINGS,
+    "pcil-gail": {
+        **PCIL_SETTINGS,
+        "every preset": {"reward": "pcil", "reward.head": "gail"},  # paper Appendix C; not in the release
+    },
+    "tcn-gail": {
+        **TCN_SETTINGS,
+        "every preset": {"reward": "tcn", "reward.temperature": 0.07, "reward.head": "gail"},  # paper Appendix C
+    },
+    "bc": {
+        "every preset": BC_SETTINGS,  # authors' agent/bc.py; width of the paper's Table
+        "released": bc_as_released,
+    },
+    "expert": {"every preset": {"reward": "expert"}, "released": expert_as_released},
+}
+"""What a method changes of every preset, and then of single ones, for some methods by task; dotted names are settings of the
+agent or the reward."""
+METHODS = tuple(METHOD_SETTINGS)
 
 
 def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: Any) -> Run:
@@ -213,32 +187,26 @@ def make(task: str, method: Any = "pcil", preset: Any = "default", **changes: An
     """
     _known("method", method, METHODS)
     _known("preset", preset, PRESETS)
-    own, changes = METHOD_SETTINGS[method, preset], renamed(changes)
-    settings: dict[str, Any] = {**PRESETS[preset](task), **(own(task) if callable(own) else own)}
-    parts = {part: changes.pop(part, settings[part]) for part in REGISTRIES}
-    made = {
-        part: modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
-        for part, named in parts.items()
-    }
-    settings = {name: value for name, value in settings.items() if _counts(name, made, settings, parts)} | changes
-    for part, instance in made.items():
-        own = {name.removeprefix(f"{part}."): settings.pop(name) for name in list(settings) if name.startswith(f"{part}.")}
-        made[part] = changed(instance, own)
+    changes, settings = renamed(changes), PRESETS[preset](task)
+    for name in ("every preset", preset):
+        own = METHOD_SETTINGS[method].get(name, {})
+        settings |= own(task) if callable(own) else own
+    made: dict[str, Any] = {}
+    for part in REGISTRIES:
+        usual, own, asked = settings.pop(part), taken(settings, part), taken(changes, part)
+        named = changes.pop(part, usual)
+        made[part] = modules.instance(f"--{part}", part_of_run(part, named)) if isinstance(named, str) else named
+        if named != usual:
+            own = {}
+        elif part == "agent":
+            own = {name: value for name, value in own.items() if hasattr(made[part], name)}
+        elif not made[part].needs_demos:
+            own.pop("batch_size", None)
+        made[part] = changed(made[part], own | asked)
+    settings |= changes
     known = {field.name for field in dataclasses.fields(Run)}
     plain = {name: settings.pop(name) for name in list(settings) if name in known}
     return changed(Run(task=task, method=method, preset=preset, **made, **plain), settings)
-
-
-def _counts(name: str, made: dict[str, Any], settings: dict[str, Any], parts: dict[str, Any]) -> bool:
-    """Whether a setting of the preset or the method applies to these parts."""
-    part, _, rest = name.partition(".")
-    if not rest:
-        return name not in parts
-    if parts[part] != settings[part]:
-        return False
-    if part == "agent":
-        return hasattr(made[part], rest.partition(".")[0])
-    return rest != "batch_size" or made[part].needs_demos
 
 
 def _known(kind: str, name: Any, names: Any) -> None:

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 from types import FrameType
@@ -66,20 +66,16 @@ class Signals:
     there all stays as it is.
     """
 
-    def __init__(self, answer: Callable[[], None], *numbers: int) -> None:
-        """`numbers` are the signals, by default these three."""
+    def __init__(self, answer: Callable[[], None], names: Sequence[str] = ("SIGINT", "SIGTERM", "SIGHUP")) -> None:
         self.number: int | None = None
-        self._answer, self._numbers = answer, set(numbers)
+        self._answer, self._names = answer, names
 
     def __enter__(self) -> Signals:
-        hangup = getattr(signal, "SIGHUP", None)  # Windows has none
-        ours = {signal.SIGINT, signal.SIGTERM} | ({hangup} if hangup is not None else set())
-        numbers = self._numbers or ours
+        numbers = [signal.Signals[name] for name in self._names if name in signal.Signals.__members__]  # Windows has no SIGHUP
         if threading.current_thread() is not threading.main_thread():
-            numbers = set()
-        elif hangup is not None and signal.getsignal(hangup) == signal.SIG_IGN:
-            numbers = numbers - {hangup}
-        self._before = {number: signal.signal(number, self._ask) for number in numbers}
+            numbers = []
+        taken = [number for number in numbers if number.name != "SIGHUP" or signal.getsignal(number) != signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._ask) for number in taken}
         return self
 
     def __exit__(self, *exception: object) -> None:

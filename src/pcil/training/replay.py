@@ -62,11 +62,6 @@ class Replay:
         """Whole episodes held."""
         return len(self._segments)
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of the rows when the ring is full, in bytes."""
-        return self._obs.nbytes + self._action.nbytes + self._reward.nbytes
-
     def num_windows(self, n: int) -> int:
         """How many windows of `n` steps may be drawn."""
         _, cumulative = self._starts(n)

@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import platform
-import signal
 import subprocess
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -81,7 +80,7 @@ def train(
     if isinstance(task, gymnasium.Env):
         changes["single_environment"] = True
     run = presets.make(envs.task_name(task), method, preset, **changes)
-    with progress.Signals(lambda: None, signal.SIGINT) as signals:
+    with progress.Signals(lambda: None, ["SIGINT"]) as signals:
         try:
             result = execute(run, Path(out), [*callbacks, _StopOn(signals)], task=task, given=given)
         except loop.Stopped:

@@ -30,6 +30,7 @@ from pcil.agents import BC, DrQV2
 from pcil.compilation import use_cache
 from pcil.rewards import REWARDS
 from pcil.training import checkpoint, learner, presets
+from pcil.training.collect import clone
 from pcil.training.config import Run
 from pcil.training.state import start
 from pcil.types import Episode, Spec
@@ -53,6 +54,7 @@ def cases() -> dict[str, Run]:
     runs["tcn with negatives of the rollout, sampled"] = small_run("tcn", reward={"negatives": "rollout", "margin": 5})
     for name, changes in (
         ("pcil with absorbing states, sampled", {"absorbing": True}),
+        ("pcil with cloning, sampled", {"cloning": True}),
         ("expert with the paper's agent, sampled", {}),
     ):
         agent = narrow(presets.make(POINT_MASS, preset="default" if changes else "paper").agent, **changes)
@@ -88,12 +90,14 @@ def five_updates(run: Run) -> dict[str, Any]:
     source = state.expert if run.agent.offline else state.replay
     assert source is not None and state.expert is not None
     rows, span = run.reward.batch_size, run.reward.span
+    clone(dataclasses.replace(run, cloning_updates=UPDATES), state)
     for i in range(UPDATES):
         window = source.sample(rng, run.agent.batch_size, run.agent.n_step)
         expert = state.expert.sample(rng, rows, span) if rows else None
         seen = source.sample(rng, rows, span) if span > run.agent.n_step else None
+        cloned = state.expert.sample(rng, run.agent.batch_size, 1) if run.agent.clones else None
         count, step = np.int32(i), np.int32(150 * i)
-        state.learner, _ = learner.update(run.learner, state.learner, window, expert, seen, step, count)
+        state.learner, _ = learner.update(run.learner, state.learner, window, expert, seen, step, count, cloned)
     metrics = {
         name: float(total) / UPDATES for name, total in state.learner.totals.items() if name not in ("updates", "finite")
     }

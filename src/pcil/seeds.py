@@ -30,6 +30,8 @@ class Stream(enum.IntEnum):
     """Resets of the evaluation environments; the counter is the index of the evaluation episode."""
     RECORD = 8
     """Resets while demonstrations are recorded; the counter is the attempt."""
+    CLONE = 9
+    """Samples from the demonstrations for behavioural cloning before the first step; the counter is 0."""
 
 
 def key(root: Any, stream: Stream, counter: Any) -> Any:

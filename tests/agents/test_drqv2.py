@@ -188,3 +188,44 @@ def test_whether_a_window_trains_the_actor_is_said_by_its_first_state(first: flo
     after, _ = ABSORBING.update(state, window, step=jnp.int32(0), key=jax.random.key(1))
     same = [np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after.actor), jax.tree.leaves(state.actor), strict=True)]
     assert all(same) if first else not any(same)
+
+
+# --- Cloning ---
+
+
+def test_cloning_takes_a_step_towards_the_demonstrated_actions_of_the_actor_alone() -> None:
+    agent = dataclasses.replace(AGENT, cloning=True, learning_rate=1e-3)
+    state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
+    obs, action = jnp.asarray(window.obs[:, 0]), jnp.asarray(window.action[:, 0])
+    error = float(agent.cloning_error(state, state.actor, window))
+    assert error == pytest.approx(float(np.mean(np.sum((np.asarray(state.actor(obs)) - action) ** 2, axis=1))), rel=1e-5)
+    after = state
+    for _ in range(20):
+        after = agent.clone(after, window)
+    assert agent.cloning_error(after, after.actor, window) < 0.9 * error
+    same = [np.array_equal(a, b) for a, b in zip(jax.tree.leaves(after.critic), jax.tree.leaves(state.critic), strict=True)]
+    assert all(same)
+
+
+def test_the_absorbing_state_has_no_action_to_clone() -> None:
+    agent = dataclasses.replace(ABSORBING, cloning=True)
+    state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
+    ends = jnp.arange(32) % 2 == 0
+    window = window._replace(obs=window.obs.at[:, 0, -1].set(jnp.where(ends, 1.0, 0.0)))
+    alive = window._replace(obs=window.obs[~ends], action=window.action[~ends])
+    other = window._replace(action=jnp.where(ends[:, None, None], -window.action, window.action))
+    expected = float(agent.cloning_error(state, state.actor, alive))
+    assert float(agent.cloning_error(state, state.actor, window)) == pytest.approx(expected, rel=1e-5)
+    assert float(agent.cloning_error(state, state.actor, other)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_with_cloning_observations_are_normalized_as_in_the_demonstrations() -> None:
+    """The first rows that the agent observes are those of the demonstrations; later ones change nothing."""
+    rows, later = jnp.asarray(random_batch(40, 3, 2, 1).obs), jnp.asarray(random_batch(40, 3, 2, 2).obs * 5 + 1)
+    for cloning in (False, True):
+        agent = dataclasses.replace(AGENT, cloning=cloning, normalize_observations=True)
+        first = agent.observe(agent.init(SPEC, key=jax.random.key(0)), rows)
+        second = agent.observe(first, later)
+        assert first.scaler is not None and second.scaler is not None
+        assert np.allclose(first.scaler.mean, rows.mean(axis=0), atol=1e-5)
+        assert np.array_equal(first.scaler.mean, second.scaler.mean) == cloning

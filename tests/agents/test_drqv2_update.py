@@ -68,8 +68,13 @@ def adam(network: Any, slope: Any, first: Any, second: Any, count: Any) -> tuple
 
 
 @jax.jit
-def naive(nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, count: Any) -> tuple[dict[str, Any], Any]:
-    """Update number `count`: target, critic step, actor step on the new critic, slow critic. Returns networks and losses."""
+def naive(
+    nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, count: Any, cloned: Window | None = None
+) -> tuple[dict[str, Any], Any]:
+    """Update number `count`: target, critic step, actor step on the new critic, slow critic. Returns networks and losses.
+
+    With `cloned` windows, the actor's loss is `-mean Q / (mean |target| + 0.001) + 10 mean |mu(s) - a|^2`.
+    """
     nets = dict(nets)
     s0, s2, a0 = w.obs[:, 0], w.obs[:, 2], w.action[:, 0]
     r, d = w.reward, w.discount
@@ -86,7 +91,15 @@ def naive(nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, 
     def actor_loss(actor: Any) -> Any:
         return -jnp.mean(jnp.minimum(*worth(nets["critic"], s0, noisy(actor, s0, actor_noise))))
 
+    def cloning_error(actor: Any) -> Any:
+        mean = jnp.tanh(layers(actor.head, features(actor.trunk, cloned.obs[:, 0])))
+        return jnp.mean(jnp.sum((mean - cloned.action[:, 0]) ** 2, axis=1))
+
     losses["actor_loss"], slope = jax.value_and_grad(actor_loss)(nets["actor"])
+    if cloned is not None:
+        losses["cloning_error"], other = jax.value_and_grad(cloning_error)(nets["actor"])
+        size = jnp.mean(jnp.abs(target)) + 1e-3
+        slope = jax.tree.map(lambda g, c: g / size + 10 * c, slope, other)
     nets["actor"], *nets["actor opt_state"] = adam(nets["actor"], slope, *nets["actor opt_state"], count)
     nets["slow"] = jax.tree.map(lambda slow, fast: 0.8 * slow + 0.2 * fast, nets["slow"], nets["critic"])
     return nets, losses
@@ -97,12 +110,15 @@ def close(got: Any, expected: Any, name: str) -> None:
         assert np.allclose(one, two, rtol=1e-3, atol=2e-5), name
 
 
-def test_three_updates_equal_the_definitions_in_float64() -> None:
+@pytest.mark.parametrize("cloning", [False, True])
+def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
     """At three steps of the noise schedule. Adam's state shows the size of each gradient, which its first step does not."""
-    state = AGENT.init(SPEC, key=jax.random.key(0))
+    agent = dataclasses.replace(AGENT, cloning=cloning)
+    state = agent.init(SPEC, key=jax.random.key(0))
+    expert = {"expert": window(9)} if cloning else {}
     steps, keys = (0, 500, 5000), [jax.random.key(10 + i) for i in range(3)]
     draws = [jax.random.normal(key, (2, 32, 2)) for key in keys]
-    update = jax.jit(lambda s, w, step, key: AGENT.update(s, w, step=step, key=key))
+    update = jax.jit(lambda s, w, step, key: agent.update(s, w, **expert, step=step, key=key))
     got: list[tuple[DrQV2State, Any]] = []
     for i in range(3):
         got.append(update(got[-1][0] if got else state, window(i), jnp.int32(steps[i]), keys[i]))
@@ -114,7 +130,9 @@ def test_three_updates_equal_the_definitions_in_float64() -> None:
             nets[f"{name} opt_state"] = [jax.tree.map(jnp.zeros_like, nets[name]) for _ in range(2)]
         for i, (after, metrics) in enumerate(got):
             noise = np.clip(DEVIATION[steps[i]] * np.asarray(draws[i], np.float64), -0.3, 0.3)
-            nets, losses = naive(nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1))
+            nets, losses = naive(
+                nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1), *map(double, expert.values())
+            )
             for name, value in losses.items():
                 assert float(metrics[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), (i, name)
             for name, network, opt_state in (

@@ -185,9 +185,12 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     updates: list[dict[str, Any]] = []
     real = learner.update
 
-    def update(method: Algorithm, state: Learner, window: Any, expert: Any, longer: Any, step: Any, count: Any) -> Any:
-        updates.append({"window": window, "expert": expert, "longer": longer, "step": int(step), "count": int(count)})
-        return real(method, state, window, expert, longer, step, count)
+    def update(
+        method: Algorithm, state: Learner, window: Any, expert: Any, longer: Any, step: Any, count: Any, cloned: Any
+    ) -> Any:
+        names = {"window": window, "expert": expert, "longer": longer, "cloned": cloned}
+        updates.append({**names, "step": int(step), "count": int(count)})
+        return real(method, state, window, expert, longer, step, count, cloned)
 
     monkeypatch.setattr(learner, "update", update)
     return updates
@@ -240,7 +243,7 @@ def test_windows_and_expert_rows_are_drawn_from_the_episodes_own_stream(drawn: l
     assert expert is not None and len(drawn) == 16
     for update in drawn:
         assert same(update["window"], state.replay.sample(rng, 6, 1)) and same(update["expert"], expert.sample(rng, 3, 1))
-        assert update["longer"] is None
+        assert update["longer"] is None and update["cloned"] is None
 
 
 @pytest.mark.parametrize("repeat", [1, 2])

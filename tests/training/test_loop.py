@@ -100,6 +100,52 @@ def test_a_stopped_run_equals_an_uninterrupted_one(
     same_run(tmp_path / "whole", tmp_path / "stopped")
 
 
+def test_a_run_that_clones_begins_with_the_clone_and_resumes_exactly(
+    demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The updates of cloning before the first step are done once, also if the first session ends in the first pass."""
+    cloned: list[Any] = []
+    real = learner.clone
+    monkeypatch.setattr(learner, "clone", lambda *given: cloned.append(given[-1]) or real(*given))
+    agent = dataclasses.replace(small_run().agent, cloning=True)
+    run = small_run(demos=demos, agent=agent, cloning_updates=40)
+    finish(run, tmp_path / "whole")
+    assert len(cloned) == 40 and all(len(window.obs) == 32 for window in cloned)
+    policy = json.loads((tmp_path / "whole" / "train.jsonl").read_text().splitlines()[-1])
+    assert policy["agent/cloning_error"] > 0
+    finish(run, tmp_path / "stopped", stops=(1, 2, 1))
+    assert len(cloned) == 80
+    same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+def test_a_clone_acts_before_the_first_step(demos: str, tmp_path: Path) -> None:
+    """Evaluated at frame 0: a clone of the optimal policy reaches most of its return, an untrained actor does not."""
+    shares = []
+    for cloning in (False, True):
+        agent = dataclasses.replace(small_run().agent, cloning=cloning, learning_rate=1e-2)
+        run = small_run(demos=demos, agent=agent, cloning_updates=400, frames=101, evaluate_every=1000)
+        finish(run, tmp_path / str(cloning))
+        first = [float(row[2]) for row in rows(tmp_path / str(cloning))[0][1:] if row[0] == "0"]
+        shares.append(np.mean(first) / Demonstrations.load(demos).return_mean)
+    assert shares[0] < 0.5 < 0.75 < shares[1]
+
+
+def test_whether_to_clone_is_decided_by_the_actions_of_the_demonstrations(demos: str, tmp_path: Path) -> None:
+    given = Demonstrations.load(demos)
+    bare = Demonstrations.from_arrays([episode.obs for episode in given.episodes], task=POINT_MASS)
+    run = dataclasses.replace(small_run(), agent=dataclasses.replace(small_run().agent, cloning=None))
+    for source, decided in ((given, True), (bare, False)):
+        said: list[str] = []
+        got = runs.prepared(run, said.append, read=lambda _, source=source: source)[0]
+        assert got.agent.clones is decided
+        assert any("no actions" in text for text in said) == (not decided)
+    asked = dataclasses.replace(run, agent=dataclasses.replace(run.agent, cloning=True))
+    with pytest.raises(InputError, match=r"agent.cloning needs the actions of demonstrations, and these have none"):
+        runs.prepared(asked, read=lambda _: bare)
+    expert = dataclasses.replace(small_run("expert"), agent=run.agent)
+    assert runs.prepared(expert)[0].agent.clones is False
+
+
 def test_another_seed_gives_another_run(demos: str, tmp_path: Path) -> None:
     for seed in (1, 2):
         finish(small_run(seed=seed, demos=demos), tmp_path / str(seed))

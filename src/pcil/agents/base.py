@@ -68,6 +68,16 @@ class Agent(abc.ABC):
     def update(self, state: Any, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[Any, Metrics]:
         """One gradient step of every network on one batch; `step` counts agent steps."""
 
+    @property
+    def clones(self) -> bool | None:
+        """Whether the agent also learns from the actions of the demonstrations; None: if they have any. An agent that does is
+        given one-step windows of them, as `expert`, in each `update` and, before the first step, in calls of `clone`."""
+        return False
+
+    def clone(self, state: Any, expert: Window) -> Any:
+        """The state after one gradient step of behavioural cloning; only called if the agent `clones`."""
+        raise NotImplementedError
+
     @abc.abstractmethod
     def actor(self, state: Any) -> Actor:
         """The part of the state that acts; nothing else leaves the device between updates."""

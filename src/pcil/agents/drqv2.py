@@ -58,13 +58,22 @@ class DrQV2(Agent):
     noise_correlation: float = 0.0
     """Correlation of the exploration noise between consecutive steps; 0 is white noise, as in DrQ-v2. Correlated noise pushes
     a joint in one direction for several steps."""
+    cloning: bool | None = False
+    """Train the actor by behavioural cloning as well, before the first step and in every update. None: if the demonstrations
+    have actions. Observations are then normalized by the statistics of the demonstrations."""
+    cloning_weight: float = 10.0
+    """Weight of the squared error of the cloned actions, relative to values of mean absolute value 1, if `cloning`."""
     normalize_observations: bool = False
     """Normalize observations by their running mean and standard deviation, so that their units make no difference."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf), noise_correlation=(0, 1))
-        check_ranges(self, feature_dim=(1, inf), hidden=(1, inf))
+        check_ranges(self, feature_dim=(1, inf), hidden=(1, inf), cloning_weight=(0, inf))
+
+    @property
+    def clones(self) -> bool | None:
+        return self.cloning
 
     def init(self, spec: Spec, *, key: PRNGKeyArray) -> DrQV2State:
         actor_key, critic_key = jax.random.split(key)
@@ -98,6 +107,18 @@ class DrQV2(Agent):
         first, second = critic(obs, add_noise(actor(obs), noise))
         return -jnp.mean(alive * jnp.minimum(first, second))
 
+    def cloning_error(self, state: DrQV2State, actor: Actor, expert: Window) -> Float[Array, ""]:
+        """The squared error of the actor's mean actions in states of the demonstrations, summed over the action's entries and
+        averaged over the windows that do not begin in the absorbing state."""
+        obs, alive = expert.obs[:, 0], self._alive(expert.obs[:, 0])
+        error = jnp.sum((actor(scaled(state.scaler, obs)) - expert.action[:, 0]) ** 2, axis=-1)
+        return jnp.sum(alive * error) / jnp.maximum(jnp.sum(alive), 1)
+
+    def clone(self, state: DrQV2State, expert: Window) -> DrQV2State:
+        gradient = jax.grad(lambda actor: self.cloning_error(state, actor, expert))(state.actor)
+        actor, opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
+        return dataclasses.replace(state, actor=actor, actor_opt_state=opt_state)
+
     def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
         """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`; `a' = 0` in the absorbing one."""
         obs_n = window.obs[:, -1]
@@ -110,9 +131,18 @@ class DrQV2(Agent):
         return 1 - obs[:, -1] if self.absorbing else jnp.ones(obs.shape[0])
 
     def observe(self, state: DrQV2State, obs: Float[Array, "rows obs"]) -> DrQV2State:
-        return dataclasses.replace(state, scaler=state.scaler and state.scaler.update(obs))
+        """With `cloning`, the first rows, which are those of the demonstrations, decide: other statistics would turn what the
+        actor has learned by cloning into another function."""
+        if state.scaler is None:
+            return state
+        before, after = state.scaler, state.scaler.update(obs)
+        if self.cloning:
+            after = jax.tree.map(lambda old, new: jnp.where(before.count == 0, new, old), before, after)
+        return dataclasses.replace(state, scaler=after)
 
-    def update(self, state: DrQV2State, window: Window, *, step: Array, key: PRNGKeyArray) -> tuple[DrQV2State, Metrics]:
+    def update(
+        self, state: DrQV2State, window: Window, *, expert: Window | None = None, step: Array, key: PRNGKeyArray
+    ) -> tuple[DrQV2State, Metrics]:
         alive = self._alive(window.obs[:, 0])
         noise = self.noise(step) * jax.random.normal(key, (2, *window.action[:, 0].shape))
         noise = jnp.clip(noise, -self.noise_clip, self.noise_clip)
@@ -122,11 +152,19 @@ class DrQV2(Agent):
         gradient, metrics = jax.grad(self.critic_loss, has_aux=True)(state.critic, obs, action, target)
         critic, critic_opt_state = adam_step(state.critic, gradient, state.critic_opt_state, self.learning_rate)
 
-        loss, gradient = jax.value_and_grad(self.actor_loss)(state.actor, critic, obs, noise[1], alive)
+        def loss_of(actor: Actor) -> tuple[Float[Array, ""], Metrics]:
+            loss = self.actor_loss(actor, critic, obs, noise[1], alive)
+            if expert is None:
+                return loss, {"actor_loss": loss}
+            error = self.cloning_error(state, actor, expert)
+            size = jnp.mean(jnp.abs(target)) + 1e-3
+            return loss / size + self.cloning_weight * error, {"actor_loss": loss, "cloning_error": error}
+
+        gradient, more = jax.grad(loss_of, has_aux=True)(state.actor)
         actor, actor_opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
 
         critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
-        metrics |= {"actor_loss": loss}
+        metrics |= more
         return DrQV2State(actor, critic, critic_target, actor_opt_state, critic_opt_state, state.scaler), metrics
 
     def actor(self, state: DrQV2State) -> Actor:

@@ -87,11 +87,14 @@ class Setup:
         import numpy as np
 
         from pcil.training import learner
+        from pcil.training.config import changed
         from pcil.training.learner import on_host
         from pcil.training.replay import Replay
         from pcil.types import Batch, Episode
 
         rng = np.random.default_rng(0)
+        if run.agent.clones is None:
+            run = changed(run, {"agent.cloning": run.reward.needs_demos})
         self.run, self.rng, self.count = run, rng, 0
 
         def normal(*shape: int) -> np.ndarray:
@@ -104,13 +107,14 @@ class Setup:
         self.window = self.replay.sample(rng, run.agent.batch_size, run.agent.n_step)
         rows = run.reward.batch_size
         self.expert = self.replay.sample(rng, rows, run.reward.span) if rows else None
+        self.cloned = self.replay.sample(rng, run.agent.batch_size, 1) if run.agent.clones else None
         demo = Batch.of(normal(501, spec.obs_dim), normal(500, spec.action_dim))
         self.state = learner.init(run.learner, spec, (demo,) * 10, 0)
         self.actor = on_host(run.agent.actor(self.state.agent))
         self.explore = run.agent.explorer(spec.action_dim, rng)
         self.obs = normal(spec.obs_dim)
         step = functools.partial(learner.update, run.learner)
-        jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, None, np.int32(0), np.int32(0))
+        jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, None, np.int32(0), np.int32(0), self.cloned)
         self.products = _products(list(_dot_generals(jaxpr.jaxpr)))
 
     def update(self, times: int) -> None:
@@ -122,7 +126,8 @@ class Setup:
 
         for _ in range(times):
             step, self.count = np.int32(self.count), self.count + 1
-            self.state, actor = learner.update(self.run.learner, self.state, self.window, self.expert, None, step, step)
+            given = self.window, self.expert, None, step, step, self.cloned
+            self.state, actor = learner.update(self.run.learner, self.state, *given)
         jax.block_until_ready((self.state, actor))
 
     def floor(self, times: int) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pcil import envs, seeds
@@ -59,6 +61,19 @@ def play(run: Run, environments: Sequence[envs.Checked], spec: Spec, state: Stat
         rollout.step(actions.copy())
     state.counters = replace(counters, episodes=numbers.stop)
     return rollout.episodes()
+
+
+def clone(run: Run, state: State) -> None:
+    """Train the actor by behavioural cloning before the first step, if the agent clones."""
+    counters = state.counters
+    if run.agent.clones and not counters.cloned:
+        assert state.expert is not None
+        rng = seeds.rng(run.seed, Stream.CLONE, 0)
+        for _ in range(run.cloning_updates):
+            cloned = state.expert.sample(rng, run.agent.batch_size, 1)
+            state.learner = learner.clone(run.learner, state.learner, cloned)
+        state.actor = jax.tree.map(jnp.copy, run.agent.actor(state.learner.agent))
+    state.counters = replace(counters, cloned=True)
 
 
 def study(run: Run, spec: Spec, state: State) -> list[Episode]:
@@ -116,6 +131,7 @@ def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.
     window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
     expert = state.expert.sample(rng, rows, span) if state.expert and rows else None
     longer = replay.sample(rng, rows, span) if span > run.agent.n_step else None
+    cloned = state.expert.sample(rng, run.agent.batch_size, 1) if state.expert and run.agent.clones else None
     step, count = np.int32(counters.steps), np.int32(counters.updates)
-    state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, longer, step, count)
+    state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, longer, step, count, cloned)
     return replace(counters, updates=counters.updates + 1)

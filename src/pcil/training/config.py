@@ -83,6 +83,8 @@ class Run:
     """Frames before the first update."""
     random_frames: int = 2000
     """Frames of uniformly random actions at the start."""
+    cloning_updates: int = 5000
+    """Updates of behavioural cloning before the first step, if the agent clones."""
     update_every: int = 2
     """Agent steps per update."""
     replay_steps: int = 500_000
@@ -128,6 +130,7 @@ class Run:
             seed=(0, 2**31 - 1),
             seed_frames=(0, inf),
             random_frames=(0, inf),
+            cloning_updates=(0, inf),
             checkpoint_seconds=(0, inf),
         )
         if self.until is not None:

@@ -50,8 +50,9 @@ def init(algorithm: Algorithm, spec: Spec, demos: Sequence[Batch], seed: int | A
     learner = Learner(agent, reward, root, {})
     window = _zeros(spec, algorithm.agent.batch_size, max(algorithm.agent.n_step, algorithm.reward.span))
     expert = _zeros(spec, algorithm.reward.batch_size, algorithm.reward.span)
+    cloned = _zeros(spec, algorithm.agent.batch_size, 1) if algorithm.agent.clones else None
     updated = functools.partial(_update, algorithm)
-    after, _ = jax.eval_shape(updated, learner, window, expert, expert, jnp.int32(0), jnp.int32(0))
+    after, _ = jax.eval_shape(updated, learner, window, expert, expert, jnp.int32(0), jnp.int32(0), cloned)
     return replace(learner, totals={name: jnp.zeros(total.shape) for name, total in after.totals.items()})
 
 
@@ -75,11 +76,13 @@ def _update(
     longer: Window | None,
     step: Array,
     count: Array,
+    cloned: Window | None = None,
 ) -> tuple[Learner, Actor]:
     """One update of the reward, then of the agent; `step` counts agent steps and `count` updates, both from 0.
 
     The reward learns from windows of the `expert`, None where no demonstrations are drawn, and from windows of the agent: from
-    those that are `longer` than `window`, if it needs such, else from the first rows of `window`, as in the authors' code. The
+    those that are `longer` than `window`, if it needs such, else from the first rows of `window`, as in the authors' code. An
+    agent that clones learns from the demonstrations' windows `cloned` too. The
     second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
     """
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
@@ -95,13 +98,20 @@ def _update(
         fresh = label(algorithm.reward, reward_state, steps(window), window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
     unsaid = {"features": frozen_embed(algorithm, learner.agent), "rewards": window.reward}
-    agent_state, agent_metrics = algorithm.agent.update(agent, window, step=step, key=agent_key)
+    demonstrated = {"expert": cloned} if algorithm.agent.clones else {}
+    agent_state, agent_metrics = algorithm.agent.update(agent, window, **demonstrated, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}
     metrics |= {name: _largest(tree) for name, tree in unsaid.items()}
     actor = algorithm.agent.actor(agent_state)
     metrics["actor"] = _largest(actor)
     return Learner(agent_state, reward_state, learner.root, _added(learner.totals, metrics)), jax.tree.map(jnp.copy, actor)
+
+
+@functools.partial(jax.jit, static_argnames="algorithm", donate_argnames="learner")
+def clone(algorithm: Algorithm, learner: Learner, cloned: Window) -> Learner:
+    """One update of behavioural cloning."""
+    return replace(learner, agent=algorithm.agent.clone(learner.agent, cloned))
 
 
 update = jax.jit(_update, static_argnames="algorithm", donate_argnames="learner")

@@ -169,7 +169,8 @@ def prepared(
     task: Any = None,
     read: Callable[[str], Demonstrations] = read_demonstrations,
 ) -> tuple[Run, Demonstrations | None, str]:
-    """The run with `agent.absorbing` decided, its demonstrations as they fit, and why the absorbing state is on or off.
+    """The run with `agent.absorbing` and `agent.cloning` decided, its demonstrations as they fit, and why the absorbing state
+    is on or off.
 
     `task` stands in for `run.task`; `read` gives the demonstrations by their name. `say` is told what a user should know.
     """
@@ -179,6 +180,7 @@ def prepared(
             found = f"their mean return is {demos.return_mean}" if demos else f"{run.method} needs none here"
             raise InputError(f"--until is a share of the demonstrations' mean return, which must be positive, but {found}.")
         run, why = with_absorbing_decided(run, demos, envs.ends_early(environment))
+        run = with_cloning_decided(run, demos, say)
     return run, demos, why
 
 
@@ -219,6 +221,21 @@ def with_absorbing_decided(run: Run, demos: Demonstrations | None, ends_early: b
         absorbing = ends_early
         why = f"an episode of {run.task} may end early" if absorbing else f"no episode of {run.task} ends early"
     return changed(run, {"agent.absorbing": absorbing}), why
+
+
+def with_cloning_decided(run: Run, demos: Demonstrations | None, say: Callable[[str], None]) -> Run:
+    """The run with `agent.cloning` decided; `InputError` where it is asked for and there are no actions to clone."""
+    actions = demos is not None and demos.has_actions
+    if run.agent.clones and not actions:
+        raise InputError(
+            f"agent.cloning needs the actions of demonstrations, and {'these have none' if demos else 'this run reads none'}; "
+            "leave it out."
+        )
+    if run.agent.clones is not None:
+        return run
+    if demos and not actions:
+        say("The demonstrations have no actions, so the actor learns from the reward alone (agent.cloning False).")
+    return changed(run, {"agent.cloning": actions})
 
 
 @contextlib.contextmanager

@@ -60,6 +60,8 @@ class Counters:
     """Agent steps."""
     episodes: int = 0
     updates: int = 0
+    cloned: bool = False
+    """Whether the actor has been trained by behavioural cloning, if the agent clones."""
     evaluations: int = 0
     good_evaluations: int = 0
     """The last evaluations, in a row, that reached the share `until` of the demonstrations' return."""

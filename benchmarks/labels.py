@@ -6,7 +6,8 @@ import shared  # isort: skip
 import sys
 from typing import Any
 
-from pcil import bench, envs
+from pcil import envs
+from pcil.bench import parts
 from pcil.demos import Demonstrations
 from pcil.training import learner, presets
 
@@ -29,9 +30,9 @@ def main(task: str = "walker_walk") -> None:
         spec = envs.spec(env)
     shared.print_row(f"{task}, {len(episode)} steps", "label, ms", "update, ms")
     for method, changes in CASES:
-        setup = bench.Setup(run := presets.make(task, method, **changes), spec)
+        setup = parts.Setup(run := presets.make(task, method, **changes), spec)
 
-        def label(setup: bench.Setup = setup) -> None:
+        def label(setup: parts.Setup = setup) -> None:
             learner.label_episode(setup.run.learner, setup.state, episode, 0)
 
         label()  # compiles

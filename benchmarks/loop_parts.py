@@ -8,9 +8,10 @@ from __future__ import annotations
 import shared  # isort: skip
 import sys
 
-from pcil import bench, envs
+from pcil import envs
+from pcil.bench import parts
 from pcil.nets import networks
-from pcil.training import learner, loop, presets, replay
+from pcil.training import learner, presets, replay
 
 
 def main(task: str = "walker_walk") -> None:
@@ -18,15 +19,15 @@ def main(task: str = "walker_walk") -> None:
     run = presets.make(task)
     with envs.opened(run.task) as env:
         environment = type(env.unwrapped)
-    parts = [
+    timed = [
         (learner, "update"),
         (environment, "step"),
         (networks.Actor, "__call__"),
         (replay.Replay, "sample"),
-        (loop, "on_host"),
+        (learner, "on_host"),
         (learner, "label_episode"),
     ]
-    timing = bench.time_loop(run, 20, parts)
+    timing = parts.time_loop(run, 20, timed)
     seconds = timing.inside | {"all else": timing.seconds - sum(timing.inside.values())}
     shared.print_row("part", "us an update", "us a call", "share")
     for name, total in sorted(seconds.items(), key=lambda part: -part[1]):

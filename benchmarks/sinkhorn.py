@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 import ot
 
-from pcil import bench, envs
+from pcil import envs
+from pcil.bench import parts
 from pcil.demos import Demonstrations
 from pcil.nets.transport import sinkhorn_plan
 from pcil.rewards import sil
@@ -89,7 +90,7 @@ def start(name: str, method: str, folder: str) -> None:
     sil.sinkhorn_plan = lambda cost, x_weight, y_weight, epsilon, _: IN_JAX[name](cost, x_weight, y_weight, epsilon)
     episode = Demonstrations.load("walker_walk").episodes[0]
     with envs.opened("walker_walk") as env:
-        setup = bench.Setup(presets.make("walker_walk", method), envs.spec(env))
+        setup = parts.Setup(presets.make("walker_walk", method), envs.spec(env))
 
     def label() -> None:
         learner.label_episode(setup.run.learner, setup.state, episode, 0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shared  # isort: skip
 import sys
 
-from pcil import bench, envs
+from pcil import envs
+from pcil.bench import parts
 from pcil.training import presets
 
 
@@ -16,8 +17,8 @@ def main(task: str = "walker_walk") -> None:
     shared.print_row(task, "update, ms", "products, ms", "ratio")
     for preset in presets.PRESETS:
         for method in presets.METHODS:
-            setup = bench.Setup(presets.make(task, method, preset), spec)
-            took = bench.medians({"update_ms": setup.update, "floor_ms": setup.floor}, seconds=3)
+            setup = parts.Setup(presets.make(task, method, preset), spec)
+            took = parts.medians({"update_ms": setup.update, "floor_ms": setup.floor}, seconds=3)
             update, floor = took["update_ms"], took["floor_ms"]
             shared.print_row(f"{preset} {method}", f"{update:.2f}", f"{floor:.2f}", f"{update / floor:.2f}")
 

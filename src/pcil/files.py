@@ -138,9 +138,9 @@ def sync(path: Path) -> None:
             os.close(descriptor)
 
 
-def read_json(path: Path, limit: int = LARGEST) -> Any:
+def read_json(path: Path) -> Any:
     """The content of a JSON file; `ValueError` or `OSError` if it can't be read."""
-    return parse_json(read_text(path, limit))
+    return parse_json(read_text(path))
 
 
 def parse_json(text: str | bytes) -> Any:

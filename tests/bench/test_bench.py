@@ -18,6 +18,7 @@ import pytest
 from jaxtyping import Array, Float
 
 from pcil import bench
+from pcil.bench import parts
 from pcil.envs.toy import PointMass
 from pcil.training import learner, presets
 from pcil.training.config import Run
@@ -44,7 +45,7 @@ def loss(weights: tuple[Array, Array], x: Float[Array, "batch in"]) -> Float[Arr
 
 def products(function: Any, *arguments: Any) -> list[Any]:
     """The matrix products that the benchmark finds in a function."""
-    return list(bench._dot_generals(jax.make_jaxpr(function)(*arguments).jaxpr))
+    return list(parts._dot_generals(jax.make_jaxpr(function)(*arguments).jaxpr))
 
 
 def flops(equation: Any) -> int:
@@ -79,7 +80,7 @@ def test_other_operations_are_no_products() -> None:
 def test_the_floor_is_the_same_products() -> None:
     """Shapes, operations and FLOPs are equal, and the compiler neither merges nor removes any product."""
     found = products(jax.value_and_grad(loss), layers(), jnp.ones((BATCH, WIDTHS[0])))
-    floor = bench._products(found)
+    floor = parts._products(found)
     again = products(floor)
     assert sorted(map(signature, again)) == sorted(map(signature, found))
     assert sum(map(flops, again)) == sum(map(flops, found))
@@ -92,7 +93,7 @@ def test_equal_products_are_each_computed() -> None:
     """Two layers of the same shape are not merged."""
     x, w = jnp.ones((4, 4)), jnp.ones((4, 4))
     found = products(lambda x, w: (x @ w, jnp.tanh(x) @ w), x, w)
-    first, second = bench._products(found)()
+    first, second = parts._products(found)()
     assert not np.array_equal(first, second)
 
 
@@ -142,7 +143,7 @@ def test_pcils_update_costs_what_the_design_says() -> None:
 
 def test_the_parts_that_are_timed_are_the_runs_own() -> None:
     run, spec = small_run("expert"), Spec(2, 2, 1)
-    setup = bench.Setup(run, spec)
+    setup = parts.Setup(run, spec)
     floor = sorted(map(signature, products(setup.products)))
     assert floor == sorted(map(signature, update_products(run, spec)))
     before = np.asarray(setup.state.agent.actor.head.weights[0])
@@ -154,8 +155,8 @@ def test_the_parts_that_are_timed_are_the_runs_own() -> None:
 def test_the_loop_is_timed_over_whole_episodes_and_left_as_it_was() -> None:
     """Episodes 5 and 6 have 50 steps each, with an update every second step."""
     update, step = learner.update, PointMass.step
-    run, parts = small_run("expert", frames=1000, evaluate_every=1000), [(learner, "update"), (PointMass, "step")]
-    timing = bench.time_loop(run, 0.0, parts)
+    run, timed = small_run("expert", frames=1000, evaluate_every=1000), [(learner, "update"), (PointMass, "step")]
+    timing = parts.time_loop(run, 0.0, timed)
     assert timing.frames == timing.calls["step"] == 2 * timing.calls["update"] == 100
     assert min(timing.inside.values()) > 0 and sum(timing.inside.values()) < timing.seconds
     assert learner.update is update and PointMass.step is step

@@ -7,7 +7,6 @@ import os
 import platform
 from collections.abc import Callable
 from importlib import metadata
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
@@ -89,9 +88,8 @@ def _cache() -> str:
     from pcil import compilation
 
     folder = compilation.cache_folder()
-    probe = Path(folder) / ".probe"
-    probe.parent.mkdir(parents=True, exist_ok=True)
-    probe.touch()
+    folder.mkdir(parents=True, exist_ok=True)
+    (probe := folder / ".probe").touch()
     probe.unlink()
     return str(folder)
 

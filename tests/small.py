@@ -37,6 +37,7 @@ def small_run(method: str = "pcil", task: str = POINT_MASS, reward: dict[str, An
         "random_frames": 100,
         "evaluate_every": 100,
         "evaluate_episodes": 2,
+        "cloning_updates": 20,
         "agent": narrow(run.agent),
         "reward": narrow(run.reward, **(reward or {})),
     }

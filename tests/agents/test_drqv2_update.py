@@ -115,10 +115,10 @@ def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
     """At three steps of the noise schedule. Adam's state shows the size of each gradient, which its first step does not."""
     agent = dataclasses.replace(AGENT, cloning=cloning)
     state = agent.init(SPEC, key=jax.random.key(0))
-    expert = {"expert": window(9)} if cloning else {}
+    more = {"cloned": window(9)} if cloning else {}
     steps, keys = (0, 500, 5000), [jax.random.key(10 + i) for i in range(3)]
     draws = [jax.random.normal(key, (2, 32, 2)) for key in keys]
-    update = jax.jit(lambda s, w, step, key: agent.update(s, w, **expert, step=step, key=key))
+    update = jax.jit(lambda s, w, step, key: agent.update(s, w, **more, step=step, key=key))
     got: list[tuple[DrQV2State, Any]] = []
     for i in range(3):
         got.append(update(got[-1][0] if got else state, window(i), jnp.int32(steps[i]), keys[i]))
@@ -131,7 +131,7 @@ def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
         for i, (after, metrics) in enumerate(got):
             noise = np.clip(DEVIATION[steps[i]] * np.asarray(draws[i], np.float64), -0.3, 0.3)
             nets, losses = naive(
-                nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1), *map(double, expert.values())
+                nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1), *map(double, more.values())
             )
             for name, value in losses.items():
                 assert float(metrics[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), (i, name)

@@ -25,7 +25,7 @@ from pcil.envs.toy import Reach
 from pcil.errors import InputError
 from pcil.policy import Policy
 from pcil.rewards import Reward
-from pcil.training import loop, presets, runs, state
+from pcil.training import fit, loop, presets, runs, state
 from pcil.training.callbacks import Callback
 from pcil.training.config import changed
 from pcil.training.replay import Replay
@@ -180,7 +180,7 @@ def test_absorbing_states_are_on_where_the_reward_is_learned_and_an_episode_may_
 def test_an_environment_that_does_not_say_so_is_taken_to_end_early_and_the_ten_tasks_do_not() -> None:
     assert envs.ends_early(envs.make(EXIT)) and envs.ends_early(envs.make("toy/reach-v0"))
     assert not envs.ends_early(envs.make("pendulum_swingup"))
-    run, why = runs.with_absorbing_decided(presets.make(EXIT), Demonstrations(EXIT, (), {}), envs.ends_early(envs.make(EXIT)))
+    run, why = fit.with_absorbing_decided(presets.make(EXIT), Demonstrations(EXIT, (), {}), envs.ends_early(envs.make(EXIT)))
     assert run.agent.absorbing and why == f"an episode of {EXIT} may end early"
 
 

@@ -301,10 +301,13 @@ def test_a_replay_that_begins_with_demonstrations_reads_them_whole(tmp_path: Pat
 
 
 def test_pcil_on_states_alone_is_bit_for_bit_pcil_on_whole_demonstrations(tmp_path: Path) -> None:
-    """The actions and rewards of the demonstrations have no influence."""
+    """Without cloning, the actions and rewards of the demonstrations have no influence; by default there is none without them."""
     states, whole = stripped(tmp_path / "data", "actions", "rewards"), tmp_path / "data" / "whole" / "point_mass-v0"
     for name, folder in (("states", states), ("whole", str(whole))):
-        result = runs.execute(small_run(demos=folder), tmp_path / name)
+        run = small_run(demos=folder)
+        if name == "whole":
+            run = dataclasses.replace(run, agent=dataclasses.replace(run.agent, cloning=False))
+        result = runs.execute(run, tmp_path / name)
         assert (result.demos_return is None) == (name == "states")
     one, other = (load_policy(tmp_path / name) for name in ("states", "whole"))
     obs = np.random.default_rng(0).normal(size=(64, 2)).astype(np.float32)

@@ -107,15 +107,15 @@ class DrQV2(Agent):
         first, second = critic(obs, add_noise(actor(obs), noise))
         return -jnp.mean(alive * jnp.minimum(first, second))
 
-    def cloning_error(self, state: DrQV2State, actor: Actor, expert: Window) -> Float[Array, ""]:
+    def cloning_error(self, state: DrQV2State, actor: Actor, cloned: Window) -> Float[Array, ""]:
         """The squared error of the actor's mean actions in states of the demonstrations, summed over the action's entries and
         averaged over the windows that do not begin in the absorbing state."""
-        obs, alive = expert.obs[:, 0], self._alive(expert.obs[:, 0])
-        error = jnp.sum((actor(scaled(state.scaler, obs)) - expert.action[:, 0]) ** 2, axis=-1)
+        obs, alive = cloned.obs[:, 0], self._alive(cloned.obs[:, 0])
+        error = jnp.sum((actor(scaled(state.scaler, obs)) - cloned.action[:, 0]) ** 2, axis=-1)
         return jnp.sum(alive * error) / jnp.maximum(jnp.sum(alive), 1)
 
-    def clone(self, state: DrQV2State, expert: Window) -> DrQV2State:
-        gradient = jax.grad(lambda actor: self.cloning_error(state, actor, expert))(state.actor)
+    def clone(self, state: DrQV2State, cloned: Window) -> DrQV2State:
+        gradient = jax.grad(lambda actor: self.cloning_error(state, actor, cloned))(state.actor)
         actor, opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
         return dataclasses.replace(state, actor=actor, actor_opt_state=opt_state)
 
@@ -141,7 +141,7 @@ class DrQV2(Agent):
         return dataclasses.replace(state, scaler=after)
 
     def update(
-        self, state: DrQV2State, window: Window, *, expert: Window | None = None, step: Array, key: PRNGKeyArray
+        self, state: DrQV2State, window: Window, *, cloned: Window | None = None, step: Array, key: PRNGKeyArray
     ) -> tuple[DrQV2State, Metrics]:
         alive = self._alive(window.obs[:, 0])
         noise = self.noise(step) * jax.random.normal(key, (2, *window.action[:, 0].shape))
@@ -154,9 +154,9 @@ class DrQV2(Agent):
 
         def loss_of(actor: Actor) -> tuple[Float[Array, ""], Metrics]:
             loss = self.actor_loss(actor, critic, obs, noise[1], alive)
-            if expert is None:
+            if cloned is None:
                 return loss, {"actor_loss": loss}
-            error = self.cloning_error(state, actor, expert)
+            error = self.cloning_error(state, actor, cloned)
             size = jnp.mean(jnp.abs(target)) + 1e-3
             return loss / size + self.cloning_weight * error, {"actor_loss": loss, "cloning_error": error}
 

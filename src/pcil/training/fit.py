@@ -1,4 +1,4 @@
-"""Whether demonstrations fit a run: what its method reads of them is there, and they are of the environment that is trained."""
+"""Whether demonstrations fit a run, and which of its settings they decide."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pcil import envs
 from pcil.demos import Demonstrations
 from pcil.demos.arrays import to_unit_box
 from pcil.errors import InputError
-from pcil.training.config import Run
+from pcil.training.config import Run, changed
 from pcil.types import Origin
 
 
@@ -45,6 +45,40 @@ def fitted(run: Run, demos: Demonstrations, env: gymnasium.Env, say: Callable[[s
     for text in told:
         say(text)
     return demos
+
+
+def with_absorbing_decided(run: Run, demos: Demonstrations | None, ends_early: bool) -> tuple[Run, str]:
+    """The run with `agent.absorbing` decided, and the reason in words; `ends_early` says whether its episodes may terminate.
+
+    Without the absorbing state an early end is worth 0 to the agent: where learned rewards are positive it avoids a goal that
+    ends the episode, and where they are negative it gives up early (Kostrikov et al. 2019, section 4.2).
+    """
+    if run.agent.absorbing is not None:
+        return run, "as agent.absorbing says"
+    ended = sum(episode.terminated for episode in demos.episodes) if demos else 0
+    if run.agent.offline or not run.reward.needs_demos:
+        absorbing, why = False, "no reward is learned"
+    elif demos and ended:
+        absorbing, why = True, f"{ended} of {len(demos.episodes)} demonstrations end early"
+    else:
+        absorbing = ends_early
+        why = f"an episode of {run.task} may end early" if absorbing else f"no episode of {run.task} ends early"
+    return changed(run, {"agent.absorbing": absorbing}), why
+
+
+def with_cloning_decided(run: Run, demos: Demonstrations | None, say: Callable[[str], None]) -> Run:
+    """The run with `agent.cloning` decided; `InputError` where it is asked for and there are no actions to clone."""
+    actions = demos is not None and demos.has_actions
+    if run.agent.clones and not actions:
+        raise InputError(
+            f"agent.cloning needs the actions of demonstrations, and {'these have none' if demos else 'this run reads none'}; "
+            "leave it out."
+        )
+    if run.agent.clones is not None:
+        return run
+    if demos and not actions:
+        say("The demonstrations have no actions, so the actor learns from the reward alone (agent.cloning False).")
+    return changed(run, {"agent.cloning": actions})
 
 
 def _clipped(demos: Demonstrations, say: Callable[[str], None]) -> Demonstrations:

@@ -98,7 +98,7 @@ def _update(
         fresh = label(algorithm.reward, reward_state, steps(window), window.reward, embed, key=label_key)
         window = window._replace(reward=fresh)
     unsaid = {"features": frozen_embed(algorithm, learner.agent), "rewards": window.reward}
-    demonstrated = {"expert": cloned} if algorithm.agent.clones else {}
+    demonstrated = {"cloned": cloned} if algorithm.agent.clones else {}
     agent_state, agent_metrics = algorithm.agent.update(agent, window, **demonstrated, step=step, key=agent_key)
     metrics = {f"reward/{name}": value for name, value in reward_metrics.items()}
     metrics |= {f"agent/{name}": value for name, value in agent_metrics.items()}

@@ -23,7 +23,7 @@ from pcil.files import flat
 from pcil.policy import Policy, load_policy
 from pcil.training import fit, loop, presets, progress, state
 from pcil.training.callbacks import LOGS, Callback, Callbacks
-from pcil.training.config import Run, changed, differences, renamed
+from pcil.training.config import Run, differences, renamed
 
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
@@ -179,8 +179,8 @@ def prepared(
         if run.until is not None and not (demos and demos.return_mean and demos.return_mean > 0):
             found = f"their mean return is {demos.return_mean}" if demos else f"{run.method} needs none here"
             raise InputError(f"--until is a share of the demonstrations' mean return, which must be positive, but {found}.")
-        run, why = with_absorbing_decided(run, demos, envs.ends_early(environment))
-        run = with_cloning_decided(run, demos, say)
+        run, why = fit.with_absorbing_decided(run, demos, envs.ends_early(environment))
+        run = fit.with_cloning_decided(run, demos, say)
     return run, demos, why
 
 
@@ -202,40 +202,6 @@ def _fitted(
             f"The demonstrations of {run.task} are all shorter than the {steps} steps that an update draws in a row."
         )
     return demos
-
-
-def with_absorbing_decided(run: Run, demos: Demonstrations | None, ends_early: bool) -> tuple[Run, str]:
-    """The run with `agent.absorbing` decided, and the reason in words; `ends_early` says whether its episodes may terminate.
-
-    Without the absorbing state an early end is worth 0 to the agent: where learned rewards are positive it avoids a goal that
-    ends the episode, and where they are negative it gives up early (Kostrikov et al. 2019, section 4.2).
-    """
-    if run.agent.absorbing is not None:
-        return run, "as agent.absorbing says"
-    ended = sum(episode.terminated for episode in demos.episodes) if demos else 0
-    if run.agent.offline or not run.reward.needs_demos:
-        absorbing, why = False, "no reward is learned"
-    elif demos and ended:
-        absorbing, why = True, f"{ended} of {len(demos.episodes)} demonstrations end early"
-    else:
-        absorbing = ends_early
-        why = f"an episode of {run.task} may end early" if absorbing else f"no episode of {run.task} ends early"
-    return changed(run, {"agent.absorbing": absorbing}), why
-
-
-def with_cloning_decided(run: Run, demos: Demonstrations | None, say: Callable[[str], None]) -> Run:
-    """The run with `agent.cloning` decided; `InputError` where it is asked for and there are no actions to clone."""
-    actions = demos is not None and demos.has_actions
-    if run.agent.clones and not actions:
-        raise InputError(
-            f"agent.cloning needs the actions of demonstrations, and {'these have none' if demos else 'this run reads none'}; "
-            "leave it out."
-        )
-    if run.agent.clones is not None:
-        return run
-    if demos and not actions:
-        say("The demonstrations have no actions, so the actor learns from the reward alone (agent.cloning False).")
-    return changed(run, {"agent.cloning": actions})
 
 
 @contextlib.contextmanager

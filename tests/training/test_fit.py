@@ -301,7 +301,7 @@ def test_a_replay_that_begins_with_demonstrations_reads_them_whole(tmp_path: Pat
 
 
 def test_pcil_on_states_alone_is_bit_for_bit_pcil_on_whole_demonstrations(tmp_path: Path) -> None:
-    """Without cloning, the actions and rewards of the demonstrations have no influence; by default there is none without them."""
+    """Without cloning, the actions and rewards have no influence; by default, nothing is cloned where there are no actions."""
     states, whole = stripped(tmp_path / "data", "actions", "rewards"), tmp_path / "data" / "whole" / "point_mass-v0"
     for name, folder in (("states", states), ("whole", str(whole))):
         run = small_run(demos=folder)

@@ -35,6 +35,7 @@ def test_the_streams_numbers_stay_what_they_were() -> None:
         "LABEL": 6,
         "EVALUATE": 7,
         "RECORD": 8,
+        "CLONE": 9,
     }
 
 

@@ -31,8 +31,8 @@ from pcil.training.config import changed
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
-    --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --agent.hidden 16
-    --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
+    --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --cloning-updates 20
+    --agent.hidden 16 --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
 """
 """`small.small_run` as command-line arguments, so that both share one compilation."""
 reset = PointMass.reset
@@ -334,7 +334,7 @@ def test_the_same_command_again_says_that_it_is_done(run: Path, demos: str, caps
 def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) -> None:
     assert (
         json.loads((run / "run.json").read_text())["run"]
-        == changed(small_run(demos=demos), {"agent.absorbing": False}).to_json()
+        == changed(small_run(demos=demos), {"agent.absorbing": False, "agent.cloning": True}).to_json()
     )
 
 

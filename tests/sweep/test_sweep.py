@@ -39,6 +39,7 @@ seed_frames = 100
 random_frames = 100
 evaluate_episodes = 2
 evaluate_every = 100
+cloning_updates = 20
 agent.hidden = 16
 agent.feature_dim = 8
 agent.noise.steps = 1000

@@ -32,7 +32,8 @@ from small import POINT_MASS, save_point_mass_demos, small_run
 
 NARROW = """
     --frames 300 --seed-frames 100 --random-frames 100 --evaluate-every 100 --evaluate-episodes 2 --cloning-updates 20
-    --agent.hidden 16 --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16 --reward.batch-size 32
+    --agent.hidden 16 --agent.feature-dim 8 --agent.batch-size 32 --agent.noise.steps 1000 --reward.hidden 16
+    --reward.batch-size 32
 """
 """`small.small_run` as command-line arguments, so that both share one compilation."""
 reset = PointMass.reset

@@ -455,6 +455,15 @@ def test_what_is_unknown_is_refused_with_what_there_is(library: Path) -> None:
     assert "folder" in refusal(lambda: Demonstrations.load(file))
 
 
+def test_a_home_directory_that_cannot_be_determined_is_no_error_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", unknown)
+    assert "'~nobody/data'" in refusal(lambda: Demonstrations.load("~nobody/data"))
+    assert Demonstrations.load("walker_walk").num_steps > 0
+
+
 def test_the_table_of_what_ships_is_read_from_the_data(library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (row,) = demos.shipped()
     original = make_demos(5, 3)

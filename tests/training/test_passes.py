@@ -206,8 +206,9 @@ def test_an_offline_agent_has_passes_of_500_updates_on_draws_of_the_demonstratio
     updates: list[Any] = []
     real = learner.update
 
-    def update(algorithm: Any, held: Any, window: Any, expert: Any, longer: Any, step: Any, count: Any) -> Any:
+    def update(algorithm: Any, held: Any, window: Any, expert: Any, longer: Any, step: Any, count: Any, cloned: Any) -> Any:
         updates.append((window, expert, int(step), int(count)))
+        assert cloned is None
         return real(algorithm, held, window, expert, longer, step, count)
 
     monkeypatch.setattr(learner, "update", update)
@@ -227,3 +228,13 @@ def test_an_offline_agent_has_passes_of_500_updates_on_draws_of_the_demonstratio
         for window, expert, *_ in updates[500 * number :][:2]:
             assert np.array_equal(window.obs, ended.expert.sample(rng, 6, 1).obs)
             assert np.array_equal(expert.obs, ended.expert.sample(rng, 3, 1).obs)
+
+
+def test_without_demonstrations_no_rows_of_them_are_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Whatever number of rows the reward asks for."""
+    experts: list[Any] = []
+    real = learner.update
+    monkeypatch.setattr(learner, "update", lambda *given: experts.append(given[3]) or real(*given))
+    assert recorded().reward.batch_size > 0
+    loop.train_loop(recorded(frames=120), tmp_path, ())
+    assert len(experts) > 20 and all(expert is None for expert in experts)

@@ -1,19 +1,27 @@
-"""Each method's update compared with its matrix products alone, on one thread: `python benchmarks/update_step.py [TASK]`."""
+"""Updates on one thread, compared with their matrix products alone: `python benchmarks/update_step.py [TASK]`.
+
+With settings, PCIL's `default` update is compared with the same update with them, one more in each row, in one process:
+`python benchmarks/update_step.py walker_walk reward.penalty_rows=32 agent.cloning=false`.
+"""
 
 from __future__ import annotations
 
 import shared  # isort: skip
+import json
 import sys
 
 from pcil import envs
 from pcil.bench import parts
 from pcil.training import presets
+from pcil.types import Spec
 
 
-def main(task: str = "walker_walk") -> None:
-    """Print milliseconds of an update and of its matrix products, and their ratio, for each method and preset."""
+def main(task: str = "walker_walk", *changes: str) -> None:
+    """Print milliseconds of an update, and ratios, for each method and preset, or for `changes` of PCIL's default."""
     with envs.opened(task) as env:
         spec = envs.spec(env)
+    if changes:
+        return compare(task, spec, changes)
     shared.print_row(task, "update, ms", "products, ms", "ratio")
     for preset in presets.PRESETS:
         for method in presets.METHODS:
@@ -21,6 +29,17 @@ def main(task: str = "walker_walk") -> None:
             took = parts.medians({"update_ms": setup.update, "floor_ms": setup.floor}, seconds=3)
             update, floor = took["update_ms"], took["floor_ms"]
             shared.print_row(f"{preset} {method}", f"{update:.2f}", f"{floor:.2f}", f"{update / floor:.2f}")
+    return None
+
+
+def compare(task: str, spec: Spec, changes: tuple[str, ...]) -> None:
+    """Each row has one more setting than the row before, a value in JSON; the parts take turns."""
+    settings = [(name, json.loads(value.lower())) for name, _, value in (change.partition("=") for change in changes)]
+    runs = [presets.make(task, **dict(settings[:count])) for count in range(len(settings) + 1)]
+    took = parts.medians({f"{i}_ms": parts.Setup(run, spec).update for i, run in enumerate(runs)}, seconds=10 * len(runs))
+    shared.print_row(task, "update, ms", "ratio")
+    for name, value in zip(["default", *changes], took.values(), strict=True):
+        shared.print_row(name, f"{value:.2f}", f"{value / took['0_ms']:.2f}")
 
 
 if __name__ == "__main__":

@@ -38,6 +38,8 @@ class PCIL(Reward):
     """The reward: similarity to the expert, or the logit of a linear classifier of embeddings ("gail")."""
     penalty: float = 10.0
     """Weight of the gradient penalty on the similarity reward."""
+    penalty_rows: int | None = None
+    """Compute the penalty on the first rows of the batch, this many; None: on all of them."""
     penalty_every: int = 1
     """Compute the penalty at every N-th update only, with N times the weight."""
     stages: int = 0
@@ -52,6 +54,8 @@ class PCIL(Reward):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ranges(self, temperature=(1e-6, inf), penalty=(0, inf), penalty_every=(1, inf), stages=(0, inf))
+        if self.penalty_rows is not None:
+            check_ranges(self, penalty_rows=(1, self.batch_size))
         check_ranges(self, stage_weight=(0, inf), hidden=(4, inf), learning_rate=(0, 1), batch_size=(2, inf))
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
@@ -84,9 +88,10 @@ class PCIL(Reward):
         loss, diagnostics = info_nce(anchor, positive, negatives, self.temperature)
 
         def slope() -> Float[Array, ""]:
-            fixed = jax.lax.stop_gradient(unit_sphere(encoder(partner)))
-            u = jax.random.uniform(mix_key, (expert.shape[0], 1))
-            mixed = interpolate(u, expert, agent[: expert.shape[0]])
+            rows = self.penalty_rows or expert.shape[0]
+            fixed = jax.lax.stop_gradient(unit_sphere(encoder(partner[:rows])))
+            u = jax.random.uniform(mix_key, (rows, 1))
+            mixed = interpolate(u, expert[:rows], agent[:rows])
             return gradient_penalty(lambda x: jnp.sum(unit_sphere(encoder(x)) * fixed, axis=-1), mixed)
 
         every = self.penalty_every

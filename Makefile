@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml uv.lock
 	touch $(STAMP)
 
 train: $(STAMP)
-	$(BIN)/pcil train walker_walk --preset default --seed 1 --frames 80000 --out runs/quickstart
+	$(BIN)/pcil train walker_walk --preset default --seed 1 --frames 80000 --evaluate-every 10000 --until 0.95 --out runs/quickstart
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

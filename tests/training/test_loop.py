@@ -687,7 +687,7 @@ def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> 
     run, folder = small_run(demos=demos), tmp_path / "run"
     with pytest.raises(loop.Stopped):
         runs.execute(run, folder, [StopAfter(1)])
-    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24, absorbing=False, cloning=True))
+    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24, absorbing=False))
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"run": other.to_json()}))
     before = (folder / "train.jsonl").read_bytes()

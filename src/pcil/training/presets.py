@@ -64,7 +64,6 @@ def default(task: str) -> dict[str, Any]:
         "random_frames": 2000,  # ours
         "agent.n_step": 1,  # ours
         "agent.learning_rate": 5e-4,  # ours
-        "agent.cloning": None,  # ours: most of the frames are saved
         "agent.normalize_observations": True,  # ours: experts learn several times faster
         "agent.noise": LinearSchedule(1.0, 0.1, 30_000),  # ours
     }

@@ -1,7 +1,7 @@
 """Updates on one thread, compared with their matrix products alone: `python benchmarks/update_step.py [TASK]`.
 
 With settings, PCIL's `default` update is compared with the same update with them, one more in each row, in one process:
-`python benchmarks/update_step.py walker_walk reward.penalty_rows=32 agent.cloning=false`.
+`python benchmarks/update_step.py walker_walk reward.penalty_rows=32 agent.cloning=true`.
 """
 
 from __future__ import annotations

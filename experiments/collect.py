@@ -20,8 +20,8 @@ def main(target: str, *folders: str) -> None:
     for folder in sorted({done.parent for top in folders for done in Path(top).rglob("DONE")}):
         run = renamed(json.loads((folder / "run.json").read_text())["run"])
         now, before = flat(run), flat(presets.make(run["task"], run["method"], run["preset"]).to_json())
-        decided = {name for name in before if before[name] is None}  # settings that were decided when the run began
-        differing = (name for name in now if now[name] != before.get(name) and name not in {*NO_VARIANT, "frames", *decided})
+        unnamed = {*NO_VARIANT, "frames", "agent.absorbing"}  # the last was decided when the run began
+        differing = (name for name in now if now[name] != before.get(name) and name not in unnamed)
         told = [f"{name}={now[name]}" for name in differing]
         rows += read_run(folder, ", ".join([run["preset"], *told]))
     new = {row[:4] for row in rows}

@@ -17,7 +17,7 @@ from jax.extend import core
 
 from pcil.training import learner, loop, runs
 from pcil.training.callbacks import Callback
-from pcil.training.config import Run, changed
+from pcil.training.config import Run
 from pcil.training.learner import on_host
 from pcil.training.replay import Replay
 from pcil.types import Batch, Episode, Spec
@@ -28,8 +28,6 @@ class Setup:
 
     def __init__(self, run: Run, spec: Spec) -> None:
         rng = np.random.default_rng(0)
-        if run.agent.clones is None:
-            run = changed(run, {"agent.cloning": run.reward.needs_demos})
         self.run, self.rng, self.count = run, rng, 0
 
         def normal(*shape: int) -> np.ndarray:

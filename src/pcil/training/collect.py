@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pcil import envs, seeds
@@ -72,7 +70,7 @@ def clone(run: Run, state: State) -> None:
         for _ in range(run.cloning_updates):
             cloned = state.expert.sample(rng, run.agent.batch_size, 1)
             state.learner = learner.clone(run.learner, state.learner, cloned)
-        state.actor = jax.tree.map(jnp.copy, run.agent.actor(state.learner.agent))
+        state.actor = learner.acting(run.learner, state.learner)
     state.counters = replace(counters, cloned=True)
 
 

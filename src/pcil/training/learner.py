@@ -82,8 +82,8 @@ def _update(
 
     The reward learns from windows of the `expert`, None where no demonstrations are drawn, and from windows of the agent: from
     those that are `longer` than `window`, if it needs such, else from the first rows of `window`, as in the authors' code. An
-    agent that clones learns from the demonstrations' windows `cloned` too. The
-    second result is a copy of the actor that stays valid while the next update overwrites the learner in place.
+    agent that clones also learns from the windows `cloned` of the demonstrations. The second result is a copy of the actor that
+    stays valid while the next update overwrites the learner in place.
     """
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
@@ -161,6 +161,11 @@ def first_not_finite(learner: Learner) -> tuple[str, int] | None:
 @jax.jit
 def _are_finite(arrays: Any) -> Any:
     return jax.tree.map(lambda array: jnp.isfinite(array).all(), arrays)
+
+
+def acting(algorithm: Algorithm, learner: Learner) -> Actor:
+    """A copy of the actor that stays valid while updates overwrite the learner in place."""
+    return jax.tree.map(jnp.copy, algorithm.agent.actor(learner.agent))
 
 
 def on_host(actor: Actor) -> Actor:

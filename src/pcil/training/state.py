@@ -103,7 +103,7 @@ def start(run: Run, spec: Spec, demos: Sequence[Episode]) -> State:
         learned = np.full(len(episode), reward)
         replay.add(episode, np.asarray(run.reward.total(learned, episode.reward), np.float32))
         left -= len(episode)
-    actor = jax.tree.map(jnp.copy, run.agent.actor(fresh.agent))
+    actor = learner.acting(run.learner, fresh)
     return State(fresh, actor, replay, Replay.of(demos) if demos else None, Counters())
 
 

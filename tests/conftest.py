@@ -8,6 +8,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_
 
 import importlib.util
 import sys
+from collections.abc import Iterator
 
 from jaxtyping import install_import_hook
 
@@ -34,6 +35,14 @@ if importlib.util.find_spec("dm_control") is None:
         return pytest.skip("DeepMind Control is not installed", allow_module_level=True)
 
     dmc.import_suite = skip_or_import
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_end_with_their_file() -> Iterator[None]:
+    """Each has some memory mappings of its own. Those of a whole session are more than Linux allows a process (65,530), and
+    JAX then crashes."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(autouse=True)

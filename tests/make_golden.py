@@ -30,7 +30,6 @@ from pcil.agents import BC, DrQV2
 from pcil.compilation import use_cache
 from pcil.rewards import REWARDS
 from pcil.training import checkpoint, learner, presets
-from pcil.training.collect import clone
 from pcil.training.config import Run
 from pcil.training.state import start
 from pcil.types import Episode, Spec
@@ -90,7 +89,9 @@ def five_updates(run: Run) -> dict[str, Any]:
     source = state.expert if run.agent.offline else state.replay
     assert source is not None and state.expert is not None
     rows, span = run.reward.batch_size, run.reward.span
-    clone(dataclasses.replace(run, cloning_updates=UPDATES), state)
+    for _ in range(UPDATES if run.agent.clones else 0):
+        window, cloned = source.sample(rng, run.agent.batch_size, 1), state.expert.sample(rng, run.agent.batch_size, 1)
+        state.learner = learner.clone(run.learner, state.learner, window, cloned)
     for i in range(UPDATES):
         window = source.sample(rng, run.agent.batch_size, run.agent.n_step)
         expert = state.expert.sample(rng, rows, span) if rows else None

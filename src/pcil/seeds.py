@@ -31,7 +31,7 @@ class Stream(enum.IntEnum):
     RECORD = 8
     """Resets while demonstrations are recorded; the counter is the attempt."""
     CLONE = 9
-    """Samples from the demonstrations for behavioural cloning before the first step; the counter is 0."""
+    """Samples for behavioural cloning before the first update; the counter is 0."""
 
 
 def key(root: Any, stream: Stream, counter: Any) -> Any:

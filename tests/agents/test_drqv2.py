@@ -217,15 +217,3 @@ def test_the_absorbing_state_has_no_action_to_clone() -> None:
     expected = float(agent.cloning_error(state, state.actor, alive))
     assert float(agent.cloning_error(state, state.actor, window)) == pytest.approx(expected, rel=1e-5)
     assert float(agent.cloning_error(state, state.actor, other)) == pytest.approx(expected, rel=1e-5)
-
-
-def test_with_cloning_observations_are_normalized_as_in_the_demonstrations() -> None:
-    """The first rows that the agent observes are those of the demonstrations; later ones change nothing."""
-    rows, later = jnp.asarray(random_batch(40, 3, 2, 1).obs), jnp.asarray(random_batch(40, 3, 2, 2).obs * 5 + 1)
-    for cloning in (False, True):
-        agent = dataclasses.replace(AGENT, cloning=cloning, normalize_observations=True)
-        first = agent.observe(agent.init(SPEC, key=jax.random.key(0)), rows)
-        second = agent.observe(first, later)
-        assert first.scaler is not None and second.scaler is not None
-        assert np.allclose(first.scaler.mean, rows.mean(axis=0), atol=1e-5)
-        assert np.array_equal(first.scaler.mean, second.scaler.mean) == cloning

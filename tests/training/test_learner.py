@@ -70,22 +70,32 @@ class Scribe(Agent):
     batch_size: int = 6
     n_step: int = 1
     greed: int = 2
+    cloning: bool = False
     acts: ClassVar[list[tuple[int, float, tuple[float, ...]]]] = []
     """Agent steps so far, updates of the actor, and random draws, for each requested action."""
 
     def init(self, spec: Spec, *, key: Any) -> dict[str, Any]:
         shapes = {"reward": (self.batch_size, self.n_step), "obs": (self.batch_size, self.n_step + 1, OBS)}
         given = {name: jnp.zeros(shape) for name, shape in shapes.items()}
-        return {"actor": marked(0), "draw": draw(key), "step": jnp.int32(-1), **given}
+        seen = {"observed": jnp.zeros(()), "cloned": jnp.zeros(())}
+        return {"actor": marked(0), "draw": draw(key), "step": jnp.int32(-1), **given, **seen}
 
-    def observe(self, state: Any, *given: Any, **named: Any) -> Any:
-        del given, named
-        return state
+    @property
+    def clones(self) -> bool:
+        return self.cloning
 
-    def update(self, state: Any, window: Window, *, step: Any, key: Any) -> tuple[dict[str, Any], Any]:
+    def observe(self, state: Any, obs: Any) -> Any:
+        return {**state, "observed": jnp.sum(obs)}
+
+    def clone(self, state: Any, cloned: Window) -> Any:
+        return {**state, "cloned": state["observed"] + 1000 * jnp.sum(cloned.action)}
+
+    def update(self, state: Any, window: Window, *, cloned: Any = None, step: Any, key: Any) -> tuple[dict[str, Any], Any]:
+        assert (cloned is not None) == self.cloning
         actor = jax.tree.map(lambda x: x + 1, state["actor"])
         seen = {"reward": jnp.asarray(window.reward), "obs": jnp.asarray(window.obs)}
-        return {"actor": actor, "draw": draw(key), "step": jnp.int32(step), **seen}, {"was": state["actor"].trunk.bias[0]}
+        after = {**state, "actor": actor, "draw": draw(key), "step": jnp.int32(step), **seen}
+        return after, {"was": state["actor"].trunk.bias[0]}
 
     def actor(self, state: Any) -> Actor:
         return state["actor"]
@@ -169,6 +179,21 @@ def test_reward_label_and_agent_draw_from_three_keys_of_the_update_and_no_two_up
 def test_metrics_are_summed_under_the_name_of_who_gave_them() -> None:
     totals = {name: float(value) for name, value in after("sampled", 3).totals.items() if name != "finite"}
     assert totals == {"agent/was": 0 + 1 + 2, "reward/was": 0 + 1 + 2, "updates": 3}
+
+
+@pytest.mark.parametrize("cloning", [False, True])
+def test_an_agent_observes_what_it_clones_beside_what_it_has_seen(cloning: bool) -> None:
+    """It observes before it learns, in an update and in one of cloning alone, which only the agent takes part in."""
+    method, cloned = Algorithm(Scribe(cloning=cloning), Recorder(), "sampled"), rows(4, 6)
+    before = learner.init(method, SPEC, [random_batch(5, OBS, ACTION)], 0)
+    own, other = float(WINDOW.obs[:, 0].sum()), float(cloned.obs[:, 0].sum())
+    given = [cloned] if cloning else []
+    after, _ = learner.update(method, before, WINDOW, EXPERT, None, np.int32(0), np.int32(0), *given)
+    assert float(after.agent["observed"]) == pytest.approx(own + other * cloning, abs=1e-4)
+    if cloning:
+        again = learner.clone(method, after, WINDOW, cloned)
+        assert float(again.agent["cloned"]) == pytest.approx(own + other + 1000 * cloned.action.sum(), rel=1e-5)
+        assert float(again.reward["updates"]) == float(again.totals["updates"]) == 1
 
 
 # --- Random draws of the loop ---

@@ -103,14 +103,21 @@ def test_a_stopped_run_equals_an_uninterrupted_one(
 def test_a_run_that_clones_begins_with_the_clone_and_resumes_exactly(
     demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The updates of cloning before the first step are done once, also if the first session ends in the first pass."""
+    """The updates of cloning before the first of all are made once, also where a session ends before them. They and each later
+    one have as many rows of the demonstrations as of the replay."""
     cloned: list[Any] = []
     real = learner.clone
-    monkeypatch.setattr(learner, "clone", lambda *given: cloned.append(given[-1]) or real(*given))
+
+    def cloning(algorithm: Any, held: learner.Learner, window: Any, rows: Any) -> learner.Learner:
+        assert not held.totals["updates"] and len(window.obs) == len(rows.obs) == 32
+        cloned.append(rows)
+        return real(algorithm, held, window, rows)
+
+    monkeypatch.setattr(learner, "clone", cloning)
     agent = dataclasses.replace(small_run().agent, cloning=True)
     run = small_run(demos=demos, agent=agent, cloning_updates=40)
     finish(run, tmp_path / "whole")
-    assert len(cloned) == 40 and all(len(window.obs) == 32 for window in cloned)
+    assert len(cloned) == 40
     policy = json.loads((tmp_path / "whole" / "train.jsonl").read_text().splitlines()[-1])
     assert policy["agent/cloning_error"] > 0
     finish(run, tmp_path / "stopped", stops=(1, 2, 1))
@@ -118,15 +125,15 @@ def test_a_run_that_clones_begins_with_the_clone_and_resumes_exactly(
     same_run(tmp_path / "whole", tmp_path / "stopped")
 
 
-def test_a_clone_acts_before_the_first_step(demos: str, tmp_path: Path) -> None:
-    """Evaluated at frame 0: a clone of the optimal policy reaches most of its return, an untrained actor does not."""
+def test_a_clone_acts_from_the_first_update_on(demos: str, tmp_path: Path) -> None:
+    """A clone of the optimal policy reaches most of its return as soon as updates begin; an untrained actor does not."""
     shares = []
     for cloning in (False, True):
-        agent = dataclasses.replace(small_run().agent, cloning=cloning, learning_rate=1e-2)
-        run = small_run(demos=demos, agent=agent, cloning_updates=400, frames=101, evaluate_every=1000)
+        agent = dataclasses.replace(small_run().agent, cloning=cloning, cloning_weight=1000.0, learning_rate=1e-3)
+        run = small_run(demos=demos, agent=agent, cloning_updates=1000, seed_frames=100, frames=101, evaluate_every=1000)
         finish(run, tmp_path / str(cloning))
-        first = [float(row[2]) for row in rows(tmp_path / str(cloning))[0][1:] if row[0] == "0"]
-        shares.append(np.mean(first) / Demonstrations.load(demos).return_mean)
+        last = [float(row[2]) for row in rows(tmp_path / str(cloning))[0][1:] if row[0] != "0"]
+        shares.append(np.mean(last) / Demonstrations.load(demos).return_mean)
     assert shares[0] < 0.5 < 0.75 < shares[1]
 
 

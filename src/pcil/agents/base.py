@@ -71,7 +71,7 @@ class Agent(abc.ABC):
     @property
     def clones(self) -> bool | None:
         """Whether the agent also learns from the actions of the demonstrations; None: if they have any. An agent that does is
-        given one-step windows of them, as `cloned`, in each `update` and, before the first step, in calls of `clone`."""
+        given one-step windows of them, as `cloned`, in each `update` and, before the first one, in calls of `clone`."""
         return False
 
     def clone(self, state: Any, cloned: Window) -> Any:

@@ -59,8 +59,8 @@ class DrQV2(Agent):
     """Correlation of the exploration noise between consecutive steps; 0 is white noise, as in DrQ-v2. Correlated noise pushes
     a joint in one direction for several steps."""
     cloning: bool | None = False
-    """Train the actor by behavioural cloning as well, before the first step and in every update. None: if the demonstrations
-    have actions. Observations are then normalized by the statistics of the demonstrations."""
+    """Train the actor by behavioural cloning as well, before the first update and in every update. None: if the demonstrations
+    have actions. The statistics of observations are then those of the demonstrations and the agent together."""
     cloning_weight: float = 10.0
     """Weight of the squared error of the cloned actions, relative to values of mean absolute value 1, if `cloning`."""
     normalize_observations: bool = False
@@ -131,14 +131,7 @@ class DrQV2(Agent):
         return 1 - obs[:, -1] if self.absorbing else jnp.ones(obs.shape[0])
 
     def observe(self, state: DrQV2State, obs: Float[Array, "rows obs"]) -> DrQV2State:
-        """With `cloning`, the first rows, which are those of the demonstrations, decide: other statistics would turn what the
-        actor has learned by cloning into another function."""
-        if state.scaler is None:
-            return state
-        before, after = state.scaler, state.scaler.update(obs)
-        if self.cloning:
-            after = jax.tree.map(lambda old, new: jnp.where(before.count == 0, new, old), before, after)
-        return dataclasses.replace(state, scaler=after)
+        return state if state.scaler is None else dataclasses.replace(state, scaler=state.scaler.update(obs))
 
     def update(
         self, state: DrQV2State, window: Window, *, cloned: Window | None = None, step: Array, key: PRNGKeyArray

@@ -61,19 +61,6 @@ def play(run: Run, environments: Sequence[envs.Checked], spec: Spec, state: Stat
     return rollout.episodes()
 
 
-def clone(run: Run, state: State) -> None:
-    """Train the actor by behavioural cloning before the first step, if the agent clones."""
-    counters = state.counters
-    if run.agent.clones and not counters.cloned:
-        assert state.expert is not None
-        rng = seeds.rng(run.seed, Stream.CLONE, 0)
-        for _ in range(run.cloning_updates):
-            cloned = state.expert.sample(rng, run.agent.batch_size, 1)
-            state.learner = learner.clone(run.learner, state.learner, cloned)
-        state.actor = learner.acting(run.learner, state.learner)
-    state.counters = replace(counters, cloned=True)
-
-
 def study(run: Run, spec: Spec, state: State) -> list[Episode]:
     """Updates on the demonstrations alone, each of which counts as an agent step; no episode is played."""
     assert state.expert is not None
@@ -124,7 +111,12 @@ def _window_steps(run: Run) -> int:
 
 
 def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.random.Generator) -> Counters:
-    """Dispatch one update on samples of the replay and the demonstrations, and return the counters after it."""
+    """Dispatch one update on samples of the replay and the demonstrations, and return the counters after it.
+
+    Before the first one, an agent that clones is trained by behavioural cloning.
+    """
+    if run.agent.clones and counters.updates == 0:
+        _clone(run, state, replay)
     rows, span = run.reward.batch_size, run.reward.span
     window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
     expert = state.expert.sample(rng, rows, span) if state.expert and rows else None
@@ -133,3 +125,13 @@ def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.
     step, count = np.int32(counters.steps), np.int32(counters.updates)
     state.learner, state.actor = learner.update(run.learner, state.learner, window, expert, longer, step, count, cloned)
     return replace(counters, updates=counters.updates + 1)
+
+
+def _clone(run: Run, state: State, replay: Replay) -> None:
+    """Train the actor by behavioural cloning."""
+    assert state.expert is not None
+    rng = seeds.rng(run.seed, Stream.CLONE, 0)
+    for _ in range(run.cloning_updates):
+        window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
+        cloned = state.expert.sample(rng, run.agent.batch_size, 1)
+        state.learner = learner.clone(run.learner, state.learner, window, cloned)

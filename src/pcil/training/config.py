@@ -84,7 +84,7 @@ class Run:
     random_frames: int = 2000
     """Frames of uniformly random actions at the start."""
     cloning_updates: int = 5000
-    """Updates of behavioural cloning before the first step, if the agent clones."""
+    """Updates of the actor by behavioural cloning alone, before all others, if the agent clones."""
     update_every: int = 2
     """Agent steps per update."""
     replay_steps: int = 500_000

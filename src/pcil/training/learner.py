@@ -87,7 +87,7 @@ def _update(
     """
     key = seeds.key(jax.random.wrap_key_data(learner.root), Stream.UPDATE, count)
     reward_key, label_key, agent_key = jax.random.split(key, 3)
-    agent = algorithm.agent.observe(learner.agent, window.obs[:, 0])
+    agent = _observed(algorithm, learner.agent, window, cloned)
     embed = frozen_embed(algorithm, agent)
     both = (
         steps(expert or Window(*(array[:0] for array in window))),
@@ -109,9 +109,19 @@ def _update(
 
 
 @functools.partial(jax.jit, static_argnames="algorithm", donate_argnames="learner")
-def clone(algorithm: Algorithm, learner: Learner, cloned: Window) -> Learner:
-    """One update of behavioural cloning."""
-    return replace(learner, agent=algorithm.agent.clone(learner.agent, cloned))
+def clone(algorithm: Algorithm, learner: Learner, window: Window, cloned: Window) -> Learner:
+    """One update of behavioural cloning before the first of `update`; `window` is what the agent has seen until then."""
+    agent = _observed(algorithm, learner.agent, window, cloned)
+    return replace(learner, agent=algorithm.agent.clone(agent, cloned))
+
+
+def _observed(algorithm: Algorithm, agent: Any, window: Window, cloned: Window | None) -> Any:
+    """The agent with its statistics updated. What it clones counts as much as what it has seen: statistics of the agent alone
+    change quickly while it learns, and the cloned actor would become another function."""
+    rows = window.obs[:, 0]
+    if algorithm.agent.clones and cloned is not None:
+        rows = jnp.concatenate([cloned.obs[:, 0], rows])
+    return algorithm.agent.observe(agent, rows)
 
 
 update = jax.jit(_update, static_argnames="algorithm", donate_argnames="learner")

@@ -10,7 +10,7 @@ from typing import Any
 from pcil import envs
 from pcil.training import state as states
 from pcil.training.callbacks import Callback, Callbacks, LogFiles, TensorBoard
-from pcil.training.collect import clone, labelled, play, store, study
+from pcil.training.collect import labelled, play, store, study
 from pcil.training.config import Run
 from pcil.training.evaluate import environments_for, evaluate
 from pcil.types import Episode
@@ -56,7 +56,6 @@ def train_loop(
 
         if state.counters.final_return is not None:
             states.save_policy(run, folder, state, spec, state.counters.final_return)
-        clone(run, state)
         saved = clock.total()
         while state.counters.final_return is None:
             with states.saved_on_failure(run, folder, state, log, clock) as refuse_divergence:

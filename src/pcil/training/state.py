@@ -60,8 +60,6 @@ class Counters:
     """Agent steps."""
     episodes: int = 0
     updates: int = 0
-    cloned: bool = False
-    """Whether the actor has been trained by behavioural cloning, if the agent clones."""
     evaluations: int = 0
     good_evaluations: int = 0
     """The last evaluations, in a row, that reached the share `until` of the demonstrations' return."""
@@ -69,6 +67,11 @@ class Counters:
     """Wall-clock time until now, over all sessions."""
     final_return: float | None = None
     """Mean return of the last evaluation, once the run is finished."""
+
+    @classmethod
+    def of(cls, meta: dict[str, Any]) -> Counters:
+        """Those of a checkpoint. Some older versions also noted whether the actor had been cloned."""
+        return cls(**{name: value for name, value in meta["counters"].items() if name != "cloned"})
 
 
 @dataclass
@@ -155,7 +158,7 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
         restored = checkpoint.unflatten("learner", fresh.learner, arrays)
         known = checkpoint.flatten("actor", fresh.actor).keys() <= arrays.keys()  # older ones have no scale of observations
         actor = checkpoint.unflatten("actor", fresh.actor, arrays) if known else run.agent.actor(restored.agent)
-        counters = Counters(**meta["counters"])
+        counters = Counters.of(meta)
     except (ValueError, TypeError) as error:
         raise InputError(
             f"The checkpoint in {folder} is of another version ({error}); go on with that one, or give another --out."
@@ -252,7 +255,7 @@ def unfinished(folder: Path, final_return: float, trust: Sequence[str] = ()) -> 
         if damage:
             raise InputError(f"{damage}, and no checkpoint has it; delete {folder / 'DONE'} to train it again.")
         return None
-    counters = Counters(**meta["counters"])
+    counters = Counters.of(meta)
     if counters.final_return is None:
         return f"{folder / 'DONE'} is there, but the last whole checkpoint is at {counters.frames:,} frames; the run goes on."
     if counters.final_return != final_return:

@@ -24,9 +24,9 @@ CASES = make_golden.cases()
 TOLERANCE = 1e-4
 """Relative. Another processor or release of XLA adds in another order, which changes the last bits. When every initial weight
 was changed in its last bit, the numbers changed by at most 2.5e-6."""
-NEARLY_TIED = 0.03
+NEARLY_TIED = 0.05
 """The fraction of pairs in an update whose scores differ only by rounding, so that an accuracy may count them either way. It
-was 0.025 with most optimisations of XLA disabled (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as in `mutants.py`)."""
+was 0.025 and, on another processor, 0.032 with most optimisations of XLA disabled (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as in `mutants.py`)."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:

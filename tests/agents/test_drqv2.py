@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax
@@ -217,3 +218,37 @@ def test_the_absorbing_state_has_no_action_to_clone() -> None:
     expected = float(agent.cloning_error(state, state.actor, alive))
     assert float(agent.cloning_error(state, state.actor, window)) == pytest.approx(expected, rel=1e-5)
     assert float(agent.cloning_error(state, state.actor, other)) == pytest.approx(expected, rel=1e-5)
+
+
+# --- The averaged actor ---
+
+
+def arrays(actor: Any) -> list[np.ndarray]:
+    return [np.asarray(leaf, np.float64) for leaf in jax.tree.leaves(actor)]
+
+
+def test_the_average_is_that_of_the_actors_after_each_update_and_starts_with_the_clone() -> None:
+    """By hand: `0.7 average + 0.3 actor` after each update. Nothing that learns depends on it."""
+    agent = dataclasses.replace(AGENT, cloning=True, averaging_rate=0.3)
+    plain = dataclasses.replace(AGENT, cloning=True)
+    state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
+    other = plain.init(SPEC, key=jax.random.key(0))
+    state, other = agent.clone(state, window), plain.clone(other, window)
+    expected = arrays(state.actor)
+    assert all(map(np.array_equal, arrays(state.averaged), expected))
+    for i in range(3):
+        given = {"cloned": window, "step": jnp.int32(i), "key": jax.random.key(i)}
+        state, other = agent.update(state, window, **given)[0], plain.update(other, window, **given)[0]
+        expected = [0.7 * average + 0.3 * actor for average, actor in zip(expected, arrays(state.actor), strict=True)]
+        assert all(np.allclose(*pair, rtol=1e-5, atol=1e-7) for pair in zip(arrays(state.averaged), expected, strict=True))
+        assert all(map(np.array_equal, arrays(state.actor), arrays(other.actor))) and other.averaged is None
+
+
+def test_the_averaged_actor_takes_the_environments_own_observations() -> None:
+    """Without the flag of the absorbing state, and normalized by itself, as the actor that explores does."""
+    agent = dataclasses.replace(ABSORBING, averaging_rate=0.5, normalize_observations=True)
+    state = agent.init(SPEC, key=jax.random.key(0))
+    state = agent.observe(state, jnp.asarray(random_batch(40, SPEC.obs_dim, 2).obs * 3 + 1))
+    averaged, obs = agent.averaged(state), random_batch(5, SPEC.obs_dim - 1, 2).obs
+    assert averaged is not None and AGENT.averaged(AGENT.init(SPEC, key=jax.random.key(0))) is None
+    assert np.array_equal(averaged(obs, np), agent.actor(state)(obs, np)), "before the first update they are equal"

@@ -26,7 +26,8 @@ TOLERANCE = 1e-4
 was changed in its last bit, the numbers changed by at most 2.5e-6."""
 NEARLY_TIED = 0.05
 """The fraction of pairs in an update whose scores differ only by rounding, so that an accuracy may count them either way. It
-was 0.025 and, on another processor, 0.032 with most optimisations of XLA disabled (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as in `mutants.py`)."""
+was 0.025 and, on another processor, 0.032 with most optimisations of XLA disabled (`JAX_DISABLE_MOST_OPTIMIZATIONS=1`, as in
+`mutants.py`)."""
 
 
 def test_every_method_and_label_has_its_numbers_and_they_say_where_they_are_from() -> None:

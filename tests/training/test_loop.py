@@ -114,7 +114,7 @@ def test_a_run_that_clones_begins_with_the_clone_and_resumes_exactly(
         return real(algorithm, held, window, rows)
 
     monkeypatch.setattr(learner, "clone", cloning)
-    agent = dataclasses.replace(small_run().agent, cloning=True)
+    agent = dataclasses.replace(small_run().agent, cloning=True, averaging_rate=0.1)
     run = small_run(demos=demos, agent=agent, cloning_updates=40)
     finish(run, tmp_path / "whole")
     assert len(cloned) == 40
@@ -135,6 +135,19 @@ def test_a_clone_acts_from_the_first_update_on(demos: str, tmp_path: Path) -> No
         last = [float(row[2]) for row in rows(tmp_path / str(cloning))[0][1:] if row[0] != "0"]
         shares.append(np.mean(last) / Demonstrations.load(demos).return_mean)
     assert shares[0] < 0.5 < 0.75 < shares[1]
+
+
+def test_the_averaged_actor_is_evaluated_and_saved(demos: str, tmp_path: Path) -> None:
+    """An average that hardly follows the actor has the same returns throughout; the actor, which learns, has not."""
+    returns = {}
+    for rate in (1e-20, 1.0):
+        agent = dataclasses.replace(small_run().agent, averaging_rate=rate, normalize_observations=False, learning_rate=1e-2)
+        finish(small_run(demos=demos, agent=agent), tmp_path / str(rate))
+        table = rows(tmp_path / str(rate))[0][1:]
+        returns[rate] = {tuple(row[2] for row in table if row[0] == frames) for frames in ("0", "300")}
+    assert len(returns[1e-20]) == 1 and len(returns[1.0]) == 2
+    held, saved = checkpoint.restore(tmp_path / "1e-20" / "checkpoint")[0], load_policy(tmp_path / "1e-20").actor
+    assert held is not None and np.array_equal(held["learner.agent.averaged.trunk.weight"], saved.trunk.weight)
 
 
 def test_whether_to_clone_is_decided_by_the_actions_of_the_demonstrations(demos: str, tmp_path: Path) -> None:

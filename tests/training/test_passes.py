@@ -177,8 +177,8 @@ def test_an_evaluation_copies_the_actor_to_the_host_once(monkeypatch: pytest.Mon
     copies: list[Any] = []
     plain = state.on_host
     monkeypatch.setattr(state, "on_host", lambda actor: copies.append(actor) or plain(actor))
-    held = state.start(recorded(), SPEC, DEMOS)
-    policy = held.policy()
+    run = recorded()
+    policy = state.start(run, SPEC, DEMOS).policy(run)
     assert all(policy(np.zeros((3, 2), np.float32)).shape == (3, 2) for _ in range(4)) and len(copies) == 1
 
 

@@ -83,6 +83,11 @@ class Agent(abc.ABC):
     def actor(self, state: Any) -> Actor:
         """The part of the state that acts; nothing else leaves the device between updates."""
 
+    def averaged(self, state: Any) -> Actor | None:
+        """The actor that is evaluated and saved in place of the one that explores; None: the same one."""
+        del state
+        return None
+
     @abc.abstractmethod
     def trunk(self, state: Any, whose: Literal["critic", "actor"]) -> Callable[[Any], Any]:
         """The features of an observation that imitation rewards are learned on, as a pytree. Rewards do not train them."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from math import inf
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -35,6 +35,8 @@ class DrQV2State(eqx.Module):
     actor_opt_state: OptState
     critic_opt_state: OptState
     scaler: Scaler | None
+    averaged: Actor | None
+    """The exponential average of the actor, if `averaging_rate` is below 1."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,9 @@ class DrQV2(Agent):
     have actions. The statistics of observations are then those of the demonstrations and the agent together."""
     cloning_weight: float = 10.0
     """Weight of the squared error of the cloned actions, relative to values of mean absolute value 1, if `cloning`."""
+    averaging_rate: float = 1.0
+    """Rate, per update, at which an average of the actor's parameters follows the actor. The average is evaluated and saved,
+    and the actor itself explores and learns. 1: there is no average."""
     normalize_observations: bool = False
     """Normalize observations by their running mean and standard deviation, so that their units make no difference."""
 
@@ -70,6 +75,7 @@ class DrQV2(Agent):
         super().__post_init__()
         check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf), noise_correlation=(0, 1))
         check_ranges(self, feature_dim=(1, inf), hidden=(1, inf), cloning_weight=(0, inf))
+        check_ranges(self, averaging_rate=(0, 1))
 
     @property
     def clones(self) -> bool | None:
@@ -81,7 +87,8 @@ class DrQV2(Agent):
         critic = Critic.init(spec.obs_dim, spec.action_dim, self.feature_dim, self.hidden, key=critic_key)
         target = jax.tree.map(jnp.copy, critic)
         scaler = Scaler.init(spec.obs_dim) if self.normalize_observations else None
-        return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic), scaler)
+        averaged = jax.tree.map(jnp.copy, actor) if self.averaging_rate < 1 else None
+        return DrQV2State(actor, critic, target, adam_init(actor), adam_init(critic), scaler, averaged)
 
     def critic_loss(
         self,
@@ -117,7 +124,8 @@ class DrQV2(Agent):
     def clone(self, state: DrQV2State, cloned: Window) -> DrQV2State:
         gradient = jax.grad(lambda actor: self.cloning_error(state, actor, cloned))(state.actor)
         actor, opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
-        return dataclasses.replace(state, actor=actor, actor_opt_state=opt_state)
+        averaged = actor if self.averaging_rate < 1 else None
+        return dataclasses.replace(state, actor=actor, actor_opt_state=opt_state, averaged=averaged)
 
     def target(self, state: DrQV2State, window: Window, noise: Float[Array, "batch action"]) -> Float[Array, " batch"]:
         """The n-step double-Q target: `sum_k gamma^k r_k + gamma^n min(Q1', Q2')(s_n, a')`; `a' = 0` in the absorbing one."""
@@ -156,13 +164,21 @@ class DrQV2(Agent):
         gradient, more = jax.grad(loss_of, has_aux=True)(state.actor)
         actor, actor_opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)
 
-        critic_target = jax.tree.map(lambda slow, fast: slow + self.tau * (fast - slow), state.critic_target, critic)
+        critic_target = _towards(critic, state.critic_target, self.tau)
+        averaged = state.averaged and _towards(actor, state.averaged, self.averaging_rate)
         metrics |= more
-        return DrQV2State(actor, critic, critic_target, actor_opt_state, critic_opt_state, state.scaler), metrics
+        return DrQV2State(actor, critic, critic_target, actor_opt_state, critic_opt_state, state.scaler, averaged), metrics
 
     def actor(self, state: DrQV2State) -> Actor:
-        trunk = self.trunk(state, "actor")
-        return Actor(trunk.without_last() if self.absorbing else trunk, state.actor.head)
+        return self._unscaled(state, state.actor)
+
+    def averaged(self, state: DrQV2State) -> Actor | None:
+        return state.averaged and self._unscaled(state, state.averaged)
+
+    def _unscaled(self, state: DrQV2State, actor: Actor) -> Actor:
+        """An actor for observations of the environment, from one for those of an update."""
+        trunk = unscaled(actor.trunk, state.scaler)
+        return Actor(trunk.without_last() if self.absorbing else trunk, actor.head)
 
     def trunk(self, state: DrQV2State, whose: Literal["critic", "actor"]) -> Trunk:
         return unscaled(state.critic.trunk if whose == "critic" else state.actor.trunk, state.scaler)
@@ -170,3 +186,8 @@ class DrQV2(Agent):
     def explorer(self, action_dim: int, rng: np.random.Generator) -> Explorer:
         noise = normal_steps(rng, action_dim, self.noise_correlation)
         return lambda actor, obs, step: add_noise(actor(obs, np), self.noise(step, np) * next(noise), np)
+
+
+def _towards(fast: Any, slow: Any, rate: float) -> Any:
+    """Parameters that follow others: `slow + rate (fast - slow)`."""
+    return jax.tree.map(lambda slow, fast: slow + rate * (fast - slow), slow, fast)

@@ -9,7 +9,7 @@ from typing import Any
 
 from pcil.errors import shown
 
-NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds", "single_environment")
+NO_VARIANT = ("task", "method", "preset", "seed", "checkpoint_seconds", "keep_replay", "single_environment")
 """Settings in which runs of the same variant may differ."""
 MAX_NAME_LENGTH = 1000
 """The largest number of characters in a name."""

@@ -62,7 +62,7 @@ class Job:
 
     def look(self) -> None:
         """Update the state from the run's folder; files that are missing or incomplete are ignored."""
-        if (self.folder / "DONE").exists():
+        if runs.finished(self.folder, self.run):
             self.state = "done"
         with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
             with files.open_regular(self.folder / "train.jsonl") as file:

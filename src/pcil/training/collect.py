@@ -67,9 +67,8 @@ def study(run: Run, spec: Spec, state: State) -> list[Episode]:
     counters = state.counters
     rng = seeds.rng(run.seed, Stream.SAMPLE, counters.episodes)
     for _ in range(OFFLINE_STEPS):
-        if counters.frames < run.frames:
-            counters = _update(run, state, state.expert, counters, rng)
-            counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
+        counters = _update(run, state, state.expert, counters, rng)
+        counters = replace(counters, steps=counters.steps + 1, frames=counters.frames + spec.action_repeat)
     state.counters = replace(counters, episodes=counters.episodes + 1)
     return []
 

@@ -20,7 +20,7 @@ from pcil.files import flat
 from pcil.rewards import PCIL, REWARDS, Reward
 from pcil.types import Spec
 
-MACHINE_SETTINGS = ("checkpoint_seconds", "single_environment")
+MACHINE_SETTINGS = ("checkpoint_seconds", "keep_replay", "single_environment")
 """Settings that change no result; a run can be resumed with other values."""
 REGISTRIES: dict[str, dict[str, Any]] = {"agent": AGENTS, "reward": REWARDS}
 EnvKwargs = Annotated[
@@ -60,7 +60,7 @@ class Run:
     seed: int = 1
     """The seed of everything random."""
     frames: int = 500_000
-    """Length of the run, in frames."""
+    """Length of the run, in frames. A finished run goes on if it is given more."""
     until: float | None = None
     """End the run early, when the mean return of two evaluations in a row is at least this share of the demonstrations' mean
     return (0.95, for example). By default the run takes all its frames."""
@@ -95,6 +95,8 @@ class Run:
     """Episodes per evaluation."""
     checkpoint_seconds: float = 120.0
     """Minimum time between two checkpoints, in seconds; checkpoints are written between episodes and when the run stops."""
+    keep_replay: bool = True
+    """Keep the replay in the checkpoint of a finished run, so that the run can go on with a larger `frames`."""
     num_envs: int = 1
     """Number of environments that are stepped side by side during training."""
     single_environment: bool = False

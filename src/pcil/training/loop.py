@@ -60,7 +60,7 @@ def train_loop(
         while state.counters.final_return is None:
             with states.saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
                 if state.counters.frames >= min(state.counters.evaluations * run.evaluate_every, run.frames):
-                    result = evaluate(state.policy(), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
+                    result = evaluate(state.policy(run), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
                     told.evaluation(state.counters.frames, clock.total(), result)
                     state.counters = states.evaluated(run, state.counters, result.mean, demos_return)
                     states.save_policy(run, folder, state, spec, result.mean)
@@ -69,7 +69,7 @@ def train_loop(
                             told.message(
                                 f"Two evaluations in a row reached {run.until:.0%} of the demonstrations' mean return."
                             )
-                        states.save(folder, state, log.contents(), clock)
+                        states.save(folder, state, log.contents(), clock, keep_replay=run.keep_replay)
                         break
                 first = state.counters.episodes + 1
                 episodes = study(run, spec, state) if run.agent.offline else play(run, training, spec, state)

@@ -25,6 +25,8 @@ from pcil.training import fit, loop, presets, progress, state
 from pcil.training.callbacks import LOGS, Callback, Callbacks
 from pcil.training.config import Run, differences, renamed
 
+FREE = ("demos", "frames", "until")
+"""Settings in which a command may differ from the `run.json` of its folder, in some ways (see `_before`)."""
 PACKAGES = ("pcil", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "dm-control", "mujoco")
 
 
@@ -105,7 +107,8 @@ class _StopOn(Callback):
 def execute(
     run: Run, folder: Path, callbacks: Sequence[Callback] = (), *, task: Any = None, given: Demonstrations | None = None
 ) -> Result:
-    """Start or resume exactly this run in `folder`; a folder with another run is refused with the difference.
+    """Start or resume exactly this run in `folder`, or go on with a finished one that is given more frames or no `until` any
+    longer; a folder with another run is refused with the difference.
 
     `task` and `given` stand in for what `run.task` and `run.demos` name. What an environment raises goes to `error.txt`.
     """
@@ -113,10 +116,11 @@ def execute(
     folder, say = files.expanded(folder), Callbacks(callbacks).message
     run, demos, why = prepared(run, say, task=task, read=lambda source: given or read_demonstrations(source))
     with _claimed(folder), files.room_for(f"The run in {folder}"), _withdrawn_if_refused(folder):
-        _describe(folder, run, demos, say)
-        if (folder / "DONE").exists() and (why_not := state.unfinished(folder, read_done(folder), run.own_modules)):
+        before = _before(run, folder, demos)
+        if (folder / "DONE").exists() and (why_not := state.unfinished(folder, run, read_done(folder))):
             say(why_not)
             (folder / "DONE").unlink()
+        _describe(folder, run, demos, before, say)
         if not (folder / "DONE").exists():
             say(f"Absorbing state: {'on' if run.agent.absorbing else 'off'}; {why}.")
             (folder / "error.txt").unlink(missing_ok=True)
@@ -223,40 +227,57 @@ def _claimed(folder: Path) -> Iterator[None]:
 def check(run: Run, folder: Path, read: Callable[[str], Demonstrations] = read_demonstrations) -> None:
     """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
     run, demos, _ = prepared(run, read=read)
-    identity = _identity(run, demos)
-    if (folder / "run.json").exists():
-        _refuse_another(run, folder, identity)
+    _before(run, folder, demos)
 
 
-def _identity(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
-    """What must be equal in a folder's `run.json` for this run to go on there, as JSON gives it back."""
+def finished(folder: Path, run: Run) -> bool:
+    """Whether `run` has nothing left to do in its folder, as far as `DONE` and `run.json` say; another run may be there."""
+    if not (folder / "DONE").exists():
+        return False
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+        before = files.read_json(folder / "run.json")["run"]
+        return before["frames"] >= run.frames and before.get("until") == run.until
+    return True
+
+
+def _description(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
+    """What a `run.json` says of the run, as JSON gives it back."""
     about = demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean}
     return {"run": run.to_json(), "demos": about}
 
 
-def _describe(folder: Path, run: Run, demos: Demonstrations | None, say: Callable[[str], None]) -> None:
-    """Write `run.json`, or check that the one which is there describes this very run."""
-    identity = _identity(run, demos)
+def _describe(
+    folder: Path, run: Run, demos: Demonstrations | None, before: dict[str, Any] | None, say: Callable[[str], None]
+) -> None:
+    """Write `run.json`, or bring the settings up to date in the one that was there `before`."""
+    description = _description(run, demos)
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):  # DeepMind Control may be absent
             versions[name] = metadata.version(name)
-    path = folder / "run.json"
-    if not path.exists():
-        files.write_text(path, json.dumps({**identity, "versions": versions, "commit": commit()}, indent=2) + "\n")
-        return
-    before = _refuse_another(run, folder, identity)
-    updated = differences(before.get("versions", {}), versions)
+    updated = differences(before.get("versions", {}), versions) if before else []
     if updated and not (folder / "DONE").exists():
         say(f"Versions changed since this run began, so it may not continue exactly: {'; '.join(updated)}.")
+    now = {**before, **description} if before else {**description, "versions": versions, "commit": commit()}
+    if not before or any(before["run"].get(name) != now["run"][name] for name in FREE):
+        files.write_text(folder / "run.json", json.dumps(now, indent=2) + "\n")
 
 
-def _refuse_another(run: Run, folder: Path, identity: dict[str, Any]) -> dict[str, Any]:
-    """What the folder's `run.json` holds; `InputError` with the difference where that is another run."""
+def _before(run: Run, folder: Path, demos: Demonstrations | None) -> dict[str, Any] | None:
+    """What the folder's `run.json` holds, None if there is none; `InputError` with the difference where that is another run.
+
+    It is the same run with more frames, without its `until`, and with demonstrations that have moved.
+    """
+    if not (folder / "run.json").exists():
+        return None
+    description = _description(run, demos)
     try:
         before = files.read_json(folder / "run.json")
-        found = differences(_completed(before["run"], run), flat(identity["run"]))
-        found += differences(before["demos"] or {}, identity["demos"] or {}, "demos.")
+        settings, about = _completed(before["run"], run), before["demos"] or {}
+        found = differences(about, description["demos"] or {}, "demos.")
+        same = {"demos": not found, "frames": settings.get("frames", 0) <= run.frames, "until": run.until is None}
+        now = {name: value for name, value in flat(description["run"]).items() if not same.get(name)}
+        found = differences({name: value for name, value in settings.items() if not same.get(name)}, now) + found
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"The folder {folder} holds a run.json that can't be read ({error}); give --out a new folder."

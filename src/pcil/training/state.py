@@ -86,9 +86,13 @@ class State:
     """The demonstrations; a checkpoint does not hold them."""
     counters: Counters
 
-    def policy(self) -> Callable[[np.ndarray], np.ndarray]:
-        """The actor's mean actions `[k, action]` of observations `[k, obs]`; its arrays are copied to the host once, here."""
-        actor = on_host(self.actor)
+    def saved_actor(self, run: Run) -> Actor:
+        """The actor that is evaluated and saved, with its arrays on the host."""
+        return on_host(run.agent.averaged(self.learner.agent) or self.actor)
+
+    def policy(self, run: Run) -> Callable[[np.ndarray], np.ndarray]:
+        """Its mean actions `[k, action]` of observations `[k, obs]`; the arrays are copied to the host once, here."""
+        actor = self.saved_actor(run)
         return lambda obs: actor(obs, np)
 
 
@@ -118,24 +122,34 @@ def absorbed(run: Run, episode: Episode) -> Episode:
 
 def evaluated(run: Run, counters: Counters, return_mean: float, demos_return: float | None) -> Counters:
     """The counters after an evaluation. It is the last one if the run has all its frames, or if two evaluations in a row have
-    reached the share `run.until` of the demonstrations' mean return."""
+    reached the share `run.until` of the demonstrations' mean return.
+
+    An evaluation that is only due because the run ends is not counted, so that the run can go on from here with more frames.
+    """
+    due = counters.frames >= counters.evaluations * run.evaluate_every
     good = run.until is not None and demos_return is not None and return_mean >= run.until * demos_return
-    good_evaluations = counters.good_evaluations + 1 if good else 0
-    last = counters.frames >= run.frames or good_evaluations == 2
-    return replace(
-        counters,
-        evaluations=counters.evaluations + 1,
-        good_evaluations=good_evaluations,
-        final_return=return_mean if last else None,
-    )
+    if due:
+        number = counters.good_evaluations + 1 if good else 0
+        counters = replace(counters, evaluations=counters.evaluations + 1, good_evaluations=number)
+    last = counters.frames >= run.frames or _good_enough(run, counters)
+    return replace(counters, final_return=return_mean if last else None)
 
 
-def save(folder: Path, state: State, logs: dict[str, str], clock: Clock) -> None:
-    """Everything that the rest of the run depends on; a finished run needs no replay, and an offline agent's is empty."""
+def _good_enough(run: Run, counters: Counters) -> bool:
+    return run.until is not None and counters.good_evaluations >= 2
+
+
+def goes_on(run: Run, counters: Counters) -> bool:
+    """Whether a run that had finished has frames left, since it is now given more of them or no `until` any longer."""
+    return counters.final_return is not None and counters.frames < run.frames and not _good_enough(run, counters)
+
+
+def save(folder: Path, state: State, logs: dict[str, str], clock: Clock, *, keep_replay: bool = True) -> None:
+    """Everything that the rest of the run depends on; an offline agent's replay is empty."""
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
     arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
-    if counters.final_return is None and state.replay.num_episodes:
+    if keep_replay and state.replay.num_episodes:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, {"counters": asdict(counters), "logs": logs})
 
@@ -163,13 +177,17 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
         raise InputError(
             f"The checkpoint in {folder} is of another version ({error}); go on with that one, or give another --out."
         ) from error
+    logs = meta.get("logs") or {
+        name: _beginning(folder / name, length, told.message) for name, length in meta["positions"].items()
+    }
+    if goes_on(run, counters):
+        too_many = counters.frames < (counters.evaluations - 1) * run.evaluate_every  # older versions counted one not due
+        counters = replace(counters, final_return=None, evaluations=counters.evaluations - too_many)
+        logs["eval.csv"] = _first_evaluations(logs["eval.csv"], counters.evaluations)
     if counters.final_return is None:
         if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
             fresh.replay.load(held)
         told.message(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    logs = meta.get("logs") or {
-        name: _beginning(folder / name, length, told.message) for name, length in meta["positions"].items()
-    }
     return State(restored, actor, fresh.replay, fresh.expert, counters), logs
 
 
@@ -184,7 +202,7 @@ def save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: f
         "action_repeat": spec.action_repeat,
         "env_kwargs": run.env_kwargs,
     }
-    Policy(on_host(state.actor), envs.task_name(run.task), info, spec).save(folder / "policy")
+    Policy(state.saved_actor(run), envs.task_name(run.task), info, spec).save(folder / "policy")
 
 
 def take_means(state: State) -> dict[str, Any]:
@@ -239,15 +257,22 @@ def _beginning(log: Path, length: int, say: Callable[[str], None]) -> str:
     return content.decode(errors="replace")
 
 
-def unfinished(folder: Path, final_return: float, trust: Sequence[str] = ()) -> str | None:
-    """What is wrong with a folder whose DONE has this final return, in a sentence, or None; its last checkpoint mends it.
+def _first_evaluations(log: str, number: int) -> str:
+    """The first evaluations in `eval.csv`; what the rows of an evaluation have in common are their frames."""
+    header, *rows = log.splitlines(keepends=True)
+    groups = [list(group) for _, group in itertools.groupby(rows, key=lambda row: row.partition(",")[0])]
+    return "".join([header, *itertools.chain.from_iterable(groups[:number])])
 
-    `InputError` where the policy is damaged and there is no checkpoint that could. `trust` are the modules that
-    the policy may name.
+
+def unfinished(folder: Path, run: Run, final_return: float) -> str | None:
+    """Why the run in a folder whose DONE has this final return is not finished, in a sentence, or None; its last checkpoint has
+    what it takes to finish it.
+
+    `InputError` where the policy is damaged and no checkpoint could mend it, or where `run` goes on and no replay was kept.
     """
     arrays, meta, _ = checkpoint.restore(folder / "checkpoint")
     try:
-        load_policy(folder, trust)
+        load_policy(folder, run.own_modules)
         damage = None if as_saved(folder / "policy") else f"{folder / 'policy' / 'policy.json'} is not what the run had written"
     except InputError as error:
         damage = str(error).partition(";")[0]
@@ -256,6 +281,13 @@ def unfinished(folder: Path, final_return: float, trust: Sequence[str] = ()) -> 
             raise InputError(f"{damage}, and no checkpoint has it; delete {folder / 'DONE'} to train it again.")
         return None
     counters = Counters.of(meta)
+    if goes_on(run, counters):
+        if not run.agent.offline and not any(name.startswith("replay.") for name in arrays):
+            raise InputError(
+                f"The finished run in {folder} has kept no replay, so it can't go on from {counters.frames:,} to "
+                f"{run.frames:,} frames; train anew with another --out."
+            )
+        return f"The run in {folder} had finished at {counters.frames:,} frames, and goes on."
     if counters.final_return is None:
         return f"{folder / 'DONE'} is there, but the last whole checkpoint is at {counters.frames:,} frames; the run goes on."
     if counters.final_return != final_return:

@@ -125,6 +125,13 @@ def test_embedding_has_a_quarter_of_the_width_and_four_layers() -> None:
     assert [weight.shape for weight in state.encoder.weights] == [(50, 256), (256, 256), (256, 256), (256, 64)]
 
 
+def test_the_representation_is_the_embedding_of_the_states_that_steps_lead_to() -> None:
+    steps = random_batch(7, 6, 2)
+    state = SETTINGS.init([steps], lambda obs: 2 * obs, key=jax.random.key(0))
+    expected = unit_sphere(state.encoder(2 * jnp.asarray(steps.next_obs)))
+    assert np.array_equal(SETTINGS.representation(state, steps, lambda obs: 2 * obs), expected) and expected.shape == (7, 4)
+
+
 def test_an_update_draws_experts_together_and_pushes_the_agent_away() -> None:
     """The sign of Eq. 1 as corrected: the margin between positive and negative similarity grows."""
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-2, penalty=0.0)
@@ -194,6 +201,12 @@ def test_a_lazy_penalty_comes_at_every_so_many_updates_and_weighs_as_much_more()
         penalty = 3 * float(usual["penalty"]) if count % 3 == 0 else 0.0
         assert float(metrics["penalty"]) == pytest.approx(penalty, rel=1e-5)
         assert float(total) == pytest.approx(float(usual["contrast_loss"]) + 10 * penalty, rel=1e-5)
+
+
+def test_without_a_count_it_is_the_first_update() -> None:
+    settings, rows = dataclasses.replace(SETTINGS, penalty_every=2), (features(1), features(2), features(3))
+    first, second = (settings.loss(ENCODER, *rows, key=jax.random.key(0), **given)[1] for given in ({}, {"count": 1}))
+    assert first["penalty"] > 0 == second["penalty"]
 
 
 def test_updates_are_counted_by_the_state() -> None:

@@ -21,8 +21,8 @@ LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
     LinearSchedule(): {"start": (0, inf), "end": (0, inf), "steps": (0, inf)},
     DrQV2(): {
         **dict.fromkeys(["batch_size", "n_step", "feature_dim", "hidden"], (1, inf)),
-        **dict.fromkeys(["gamma", "learning_rate", "tau", "noise_correlation"], (0, 1)),
-        "noise_clip": (0, inf),
+        **dict.fromkeys(["gamma", "learning_rate", "tau", "noise_correlation", "averaging_rate"], (0, 1)),
+        **dict.fromkeys(["noise_clip", "cloning_weight"], (0, inf)),
     },
     BC(): {"learning_rate": (0, 1), "deviation": (1e-6, inf), "feature_dim": (1, inf), "hidden": (1, inf)},
     PCIL(): {
@@ -30,6 +30,7 @@ LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
         **{"temperature": (1e-6, inf), "penalty_every": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
         "learning_rate": (0, 1),
     },
+    PCIL(penalty_rows=3): {"penalty_rows": (1, PCIL().batch_size)},
     TCN(): {"temperature": (1e-6, inf), "window": (1, inf), "margin": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
     TCN(negatives="rollout", window=3): {"margin": (4, inf), "learning_rate": (0, 1)},
     DAC(): {"batch_size": (1, inf), "penalty": (0, inf), "hidden": (1, inf), "learning_rate": (0, 1)},

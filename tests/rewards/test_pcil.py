@@ -51,7 +51,7 @@ def update(settings: PCIL, state: EmbeddingState, expert: Batch, agent: Batch, *
 def test_loss_equals_a_naive_one(temperature: float, rows: int | None) -> None:
     """Loops over anchors and negatives in float64, with the same positives and mixtures that the key gives."""
     settings = dataclasses.replace(SETTINGS, temperature=temperature, penalty_rows=rows)
-    expert, agent, partner, key = features(1), features(2), features(3), jax.random.key(4)
+    expert, agent, partner, key = features(1), features(2), features(3), jax.random.key(5)
     total, metrics = settings.loss(ENCODER, expert, agent, partner, key=key)
 
     shift_key, mix_key = jax.random.split(key)
@@ -62,7 +62,7 @@ def test_loss_equals_a_naive_one(temperature: float, rows: int | None) -> None:
         positive = math.exp(phi_e[i] @ positives[i] / temperature)
         negatives = sum(math.exp(phi_e[i] @ phi_a[j] / temperature) for j in range(32))
         losses.append(-math.log(positive / (positive + negatives)))
-    assert float(metrics["contrast_loss"]) == pytest.approx(np.mean(losses), rel=1e-4)
+    assert float(metrics["contrast_loss"]) == pytest.approx(np.mean(losses), rel=1e-5)
 
     u = jax.random.uniform(mix_key, (rows or 32, 1))
     slopes = []

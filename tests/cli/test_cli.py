@@ -26,6 +26,7 @@ from pcil.demos import Demonstrations, shipped_tasks
 from pcil.envs import TASKS
 from pcil.envs.toy import PointMass
 from pcil.policy import load_policy
+from pcil.report import figures
 from pcil.training import presets
 from pcil.training.config import changed
 from small import POINT_MASS, save_point_mass_demos, small_run
@@ -322,6 +323,21 @@ def test_training_ends_with_a_plain_statement(trained: tuple[Path, str], demos: 
     assert curve == f"Learning curve: {folder / 'curve.png'}" and (folder / "curve.png").exists()
     assert [line.split()[0] for line in progress] == ["Absorbing", "0", "100", "200", "300"]
     assert progress[0] == f"Absorbing state: off; no episode of {POINT_MASS} ends early."
+
+
+def test_the_curve_is_drawn_anew_at_each_evaluation_after_the_first(
+    demos: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From all evaluations until then, of two episodes each."""
+    drawn: list[int] = []
+
+    def draw(folder: Path, expert: float | None) -> Path:
+        drawn.append(len((folder / "eval.csv").read_text().splitlines()) - 1)
+        return folder / "curve.png"
+
+    monkeypatch.setattr(figures, "run_curve", draw)
+    assert cli.main(narrow_run(demos, tmp_path / "run")) == 0
+    assert drawn == [4, 6, 8, 8]
 
 
 def test_the_same_command_again_says_that_it_is_done(run: Path, demos: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,12 +16,21 @@ def main(argv: list[str]) -> int:
 
 
 def _run(run: "Run", out: Path, callbacks: "Sequence[Callback]") -> int:
-    """Train with a progress bar; finally print the return compared with the expert's, and draw the learning curve."""
+    """Train with a progress bar and a learning curve; finally print the return compared with the expert's."""
+    from pcil import files
     from pcil.training import loop, progress, runs
+
+    class Curve(progress.Callback):
+        """Draws the learning curve anew at every evaluation."""
+
+        def evaluation(self, frames: int, seconds: float, result: Any) -> None:
+            del seconds, result
+            if frames:
+                _draw_curve(files.expanded(out), bar.expert_return)
 
     with progress.Bar(progress.Screen(), _shipped_return(run)) as bar:
         try:
-            result = runs.execute(run, out, [bar, *callbacks])
+            result = runs.execute(run, out, [bar, Curve(), *callbacks])
         except loop.Stopped:
             bar.message(f"Stopped; the run in {out} is saved, and the same command goes on from here.")
             return 128 + int(bar.signal or 0)
@@ -31,20 +40,23 @@ def _run(run: "Run", out: Path, callbacks: "Sequence[Callback]") -> int:
         share = f", {progress.compared(result.final_return, expert)}" if expert is not None else ""
         bar.message(f"Final return {result.final_return:.1f}{share} (mean of {run.evaluate_episodes} episodes).")
         bar.message(f"Policy: {result.folder / 'policy'}")
-        _draw_curve(result.folder, expert, bar)
+        if path := _draw_curve(result.folder, expert):
+            bar.message(f"Learning curve: {path}")
+        else:
+            bar.message("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
     return 0
 
 
-def _draw_curve(out: Path, expert: float | None, bar: Any) -> None:
+def _draw_curve(out: Path, expert: float | None) -> Path | None:
+    """Draw the learning curve of the run, and return its path; None without matplotlib."""
     from pcil import files
 
     try:
         from pcil.report import figures
     except ImportError:
-        bar.message("No learning curve is drawn without matplotlib; pip install '.[report]' in a clone brings it.")
-    else:
-        with files.room_for(f"Drawing {out / 'curve.png'}"):
-            bar.message(f"Learning curve: {figures.run_curve(out, expert)}")
+        return None
+    with files.room_for(f"Drawing {out / 'curve.png'}"):
+        return figures.run_curve(out, expert)
 
 
 def _shipped_return(run: "Run") -> float | None:

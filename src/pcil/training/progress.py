@@ -24,9 +24,14 @@ from pcil.training.callbacks import Callback, History
 from pcil.training.config import Run
 from pcil.training.evaluate import Evaluation
 
+WIDE, NARROW = 120, 80
+"""Columns that a terminal must have for the whole line, and for all of its numbers but the time elapsed."""
+LONGEST_NAME = len("acrobot_swingup expert")
+FIELDS = ("description", "fields[amount]", "fields[returns]")
+
 
 class _TimeLeft(ProgressColumn):
-    """Time left at the speed since the bar began; a resumed run's head start does not count as speed."""
+    """Time left at the speed in `rate`."""
 
     def render(self, task: Task) -> Text:
         left = time_left((task.total or 0) - task.completed, task.fields["rate"])
@@ -99,16 +104,11 @@ class Bar(Callback):
         self.evaluations: list[tuple[int, float]] = []
         self.expert_return = expert_return
         self._began: tuple[float, int] | None = None
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TextColumn("{task.fields[amount]}"),
-            TimeElapsedColumn(),
-            _TimeLeft(),
-            TextColumn("{task.fields[returns]}"),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._width = console.width
+        name, amount, returns = (TextColumn(f"{{task.{field}}}", markup=False) for field in FIELDS)
+        wide = [name, BarColumn(), amount, TimeElapsedColumn(), _TimeLeft(), returns]
+        columns = wide if self._width >= WIDE else [name, amount, _TimeLeft(), returns]
+        self._progress = Progress(*columns, console=console, disable=not console.is_terminal)
         self._task = self._progress.add_task("starting", total=None, amount="", returns="", rate=0.0)
 
     def __enter__(self) -> Bar:
@@ -131,16 +131,18 @@ class Bar(Callback):
             self.expert_return = history.demos_return
 
     def episode(self, row: dict[str, Any]) -> None:
-        """Advance the bar; the speed is measured from the first episode of this session, compilation left out."""
-        if "return" not in row:  # of an offline agent, which plays none
-            return
-        frames = row["frames"]
+        """Advance the bar. The speed is that since the first row of this session with updates, so that neither compilation nor
+        the random steps at the start of a run count."""
+        frames, total = row["frames"], self._run.frames
         now = time.perf_counter()
-        self._began = self._began or (now, frames)
-        seconds = now - self._began[0]
-        rate = (frames - self._began[1]) / seconds if seconds > 0 else 0.0
-        amount = f"{frames:,}/{self._run.frames:,} frames  {rate:,.0f}/s"
-        self._update(frames, rate=rate, amount=amount, returns=self._returns(row["return"]))
+        if row.get("updates"):
+            self._began = self._began or (now, frames)
+        seconds, since = (now - self._began[0], frames - self._began[1]) if self._began else (0.0, 0)
+        rate = since / seconds if seconds > 0 else 0.0
+        amount = f"{frames:,}/{total:,} frames" if self._width >= WIDE else f"{frames:,}/{total:,}"
+        amount = f"{amount}  {rate:,.0f}/s" if self._width >= NARROW else f"{frames // 1000}k/{total // 1000}k"
+        returns = {"returns": self._returns(row["return"])} if "return" in row else {}  # an offline agent plays no episode
+        self._update(frames, rate=rate, amount=amount, **returns)
 
     def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
         """One line for each evaluation, beside the expert's return."""
@@ -161,11 +163,13 @@ class Bar(Callback):
 
     def _update(self, frames: int, **fields: Any) -> None:
         name = shown(f"{self._run.task} {self._run.method}", 60)
+        name = name if self._width >= WIDE or len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME - 1]}…"
         self._progress.update(self._task, description=name, completed=frames, total=self._run.frames, **fields)
 
     def _returns(self, total_reward: float) -> str:
         last = f"return {total_reward:.0f}"
-        return f"{last} of {self.expert_return:.0f}" if self.expert_return is not None else last
+        compared = self.expert_return is not None and self._width >= NARROW
+        return f"{last} of {self.expert_return:.0f}" if compared else last
 
     def _stopping(self) -> None:
         self.message("Stopping after this episode; Ctrl-C again stops at once and loses what came since the last checkpoint.")

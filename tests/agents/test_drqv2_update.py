@@ -144,6 +144,24 @@ def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
             close(after.critic_target, nets["slow"], f"slow critic of update {i}")
 
 
+def test_the_value_is_divided_by_a_thousandth_where_targets_are_zero() -> None:
+    """The gradient of `-1000 mean min(Q1, Q2) + 10 |mu - a|^2`; a tenth of it is Adam's first moment."""
+    agent = dataclasses.replace(AGENT, cloning=True)
+    state, key, cloned = agent.init(SPEC, key=jax.random.key(0)), jax.random.key(1), window(9)
+    nothing, cloned = (Window(*map(jnp.asarray, rows)) for rows in (window(0), cloned))
+    nothing = nothing._replace(reward=jnp.zeros((32, 2)), discount=jnp.zeros((32, 2)))
+    after, _ = agent.update(state, nothing, cloned=cloned, step=jnp.int32(0), key=key)
+    noise = jnp.clip(DEVIATION[0] * jax.random.normal(key, (2, 32, 2)), -0.3, 0.3)[1]
+
+    def loss(actor: Actor) -> Any:
+        value = agent.actor_loss(actor, after.critic, nothing.obs[:, 0], noise, jnp.ones(32))
+        return 1000 * value + 10 * agent.cloning_error(state, actor, cloned)
+
+    slopes = jax.tree.leaves(jax.grad(loss)(state.actor))
+    for got, slope in zip(jax.tree.leaves(after.actor_opt_state[0].mu), slopes, strict=True):
+        assert np.allclose(got, 0.1 * slope, rtol=1e-3, atol=1e-3 * float(jnp.abs(slope).max()))
+
+
 # --- Noise over time ---
 
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pcil.errors import check_kinds, check_ranges
+from pcil.errors import InputError, check_kinds, check_ranges
 from pcil.types import Spec, Window
 
 
@@ -82,6 +82,11 @@ class Agent(abc.ABC):
     @abc.abstractmethod
     def actor(self, state: Any) -> Actor:
         """The part of the state that acts; nothing else leaves the device between updates."""
+
+    def started_from(self, state: Any, actor: Actor) -> Any:
+        """The state before the first update, with the actor of a policy, for a warm start; `InputError` if that can't be."""
+        del state, actor
+        raise InputError(f"{type(self).__name__} starts from no policy")
 
     def averaged(self, state: Any) -> Actor | None:
         """The actor that is evaluated and saved in place of the one that explores; None: the same one."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import InputError, check_ranges
-from pcil.nets.networks import Actor, Scaler, Trunk, scaled, unscaled
+from pcil.nets.networks import Actor, Scaler, Trunk, scaled, unpacked, unscaled
 from pcil.nets.optimiser import OptState, adam_init, adam_step
 from pcil.types import Spec, Window
 
@@ -79,6 +79,10 @@ class BC(Agent):
 
     def actor(self, state: BCState) -> Actor:
         return Actor(self.trunk(state, "actor"), state.actor.head)
+
+    def started_from(self, state: BCState, actor: Actor) -> BCState:
+        actor, scaler = unpacked(actor, state.actor, state.scaler, absorbing=False)
+        return dataclasses.replace(state, actor=actor, scaler=scaler)
 
     def trunk(self, state: BCState, whose: Literal["critic", "actor"]) -> Trunk:
         del whose

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pcil.errors import InputError
+
 LAYER_NORM_EPSILON = 1e-5
 SCALER_RATE = 1e-3
 """The smallest weight of a new batch in the running statistics of observations."""
@@ -169,6 +171,30 @@ class Actor(eqx.Module):
 
     def __call__(self, obs: Float[Any, "*batch obs"], xp: ModuleType = jnp) -> Float[Any, "*batch action"]:
         return xp.tanh(self.head(self.trunk(obs, xp), xp))
+
+
+def unpacked(actor: Actor, like: Actor, scaler: Scaler | None, *, absorbing: bool) -> tuple[Actor, Scaler | None]:
+    """An actor of normalized observations and their statistics, from an actor of observations in the environment's units.
+
+    The statistics are kept as if there had been so many batches that new ones change them slowly, since other statistics would
+    make the actor another function. With `absorbing`, observations have one more entry, which the actor gives the weight 0.
+    `InputError` if the actor's sizes are not those of `like`, or if it normalizes observations and there is no `scaler`.
+    """
+    normalizer, more = actor.trunk.normalizer, int(absorbing)
+    weight = jnp.pad(jnp.asarray(actor.trunk.weight), ((0, more), (0, 0)))
+    plain = Actor(dataclasses.replace(actor.trunk, weight=weight, normalizer=None), actor.head)
+    sizes = [[leaf.shape for leaf in jax.tree.leaves(each)] for each in (plain, like)]
+    if sizes[0] != sizes[1]:
+        raise InputError(f"its arrays have shapes {sizes[0]}, and those of this run's actor have {sizes[1]}")
+    if scaler is None and normalizer is not None:
+        raise InputError("it normalizes observations; set agent.normalize_observations to True")
+    if scaler is not None:
+        obs_dim = scaler.mean.shape[0]
+        mean, deviation = (normalizer.mean, normalizer.deviation) if normalizer else (jnp.zeros(obs_dim - more), 1.0)
+        variance = jnp.broadcast_to(jnp.asarray(deviation) ** 2, obs_dim - more)
+        rows = jnp.pad(jnp.asarray(mean), (0, more)), jnp.pad(variance, (0, more), constant_values=1.0)
+        scaler = Scaler(*rows, jnp.float32(1 / SCALER_RATE))
+    return jax.tree.map(jnp.array, plain), scaler
 
 
 class Critic(eqx.Module):

@@ -64,6 +64,8 @@ class Run:
     until: float | None = None
     """End the run early, when the mean return of two evaluations in a row is at least this share of the demonstrations' mean
     return (0.95, for example). By default the run takes all its frames."""
+    init: str | None = None
+    """The folder of an earlier run or policy of the same sizes, from which the networks of the agent start (a warm start)."""
     demos: str | None = None
     """A shipped task, the folder of a Minari dataset or the id of a local one; by default what ships for the task."""
     num_demos: int | None = None

@@ -9,6 +9,7 @@ from typing import Any
 
 from pcil import envs
 from pcil.training import state as states
+from pcil.training import warm
 from pcil.training.callbacks import Callback, Callbacks, LogFiles, TensorBoard
 from pcil.training.collect import labelled, play, store, study
 from pcil.training.config import Run
@@ -49,6 +50,7 @@ def train_loop(
         )
         spec = envs.spec(training[0])
         state, logs = states.resume(run, folder, states.start(run, spec, demos), Callbacks(callbacks))
+        state = state if logs else warm.started(run, state, Callbacks(callbacks).message)
         clock, log = states.Clock(state.counters.seconds), LogFiles(folder, logs, Callbacks(callbacks))
         told = Callbacks([log, TensorBoard(), *callbacks])
         stack.callback(told.end)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pcil.agents.base import Agent, Explorer, Metrics
 from pcil.errors import check_ranges
 from pcil.nets.losses import n_step_target
-from pcil.nets.networks import Actor, Critic, Scaler, Trunk, scaled, unscaled
+from pcil.nets.networks import Actor, Critic, Scaler, Trunk, scaled, unpacked, unscaled
 from pcil.nets.noise import LinearSchedule, add_noise, normal_steps
 from pcil.nets.optimiser import OptState, adam_init, adam_step
 from pcil.types import Spec, Window
@@ -171,6 +171,11 @@ class DrQV2(Agent):
 
     def actor(self, state: DrQV2State) -> Actor:
         return self._unscaled(state, state.actor)
+
+    def started_from(self, state: DrQV2State, actor: Actor) -> DrQV2State:
+        actor, scaler = unpacked(actor, state.actor, state.scaler, absorbing=bool(self.absorbing))
+        averaged = jax.tree.map(jnp.copy, actor) if state.averaged else None
+        return dataclasses.replace(state, actor=actor, scaler=scaler, averaged=averaged)
 
     def averaged(self, state: DrQV2State) -> Actor | None:
         return state.averaged and self._unscaled(state, state.averaged)

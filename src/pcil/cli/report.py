@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from rich.console import Console
+from rich.progress import track
 
 from pcil.cli import arguments
 from pcil.errors import InputError, shown
@@ -39,10 +42,16 @@ def report(
         if rollouts and found.sources:
             from pcil.report import film, representation
 
-            representation.add(found, trust)
-            films = film.films(found, trust)
+            representation.add(found, trust, _track)
+            films = film.films(found, trust, _track)
         print("\n".join(map(shown, [*found.notes, f"Report: {page.build(found, out, films)}"])))
     return 0
+
+
+def _track(items: Sequence[Any], name: str) -> Iterable[Any]:
+    """Go through the items with a progress bar on standard error, if that is a terminal."""
+    console = Console(stderr=True)
+    return track(items, name, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:

@@ -18,11 +18,13 @@ def project(
     """A row for each transition, the experts' first. `reward` is the environment's, and `run` a row of the agent's run."""
     from sklearn.manifold import TSNE
     from sklearn.metrics import silhouette_samples
+    from threadpoolctl import threadpool_limits
 
     both = np.concatenate([expert, agent]).astype(np.float64)
     distance = np.linalg.norm(both - both[: len(expert)].mean(axis=0), axis=1)
     silhouette = np.asarray(silhouette_samples(both, np.arange(len(both)) < len(expert)))
-    positions = TSNE(perplexity=min(30.0, len(both) / 4), init="pca", random_state=0).fit_transform(both)
+    with threadpool_limits(1):  # for so few rows, threads that wait for each other on a busy machine take fifty times as long
+        positions = TSNE(perplexity=min(30.0, len(both) / 4), init="pca", random_state=0).fit_transform(both)
     rewards = [None] * len(expert) + [_rounded(value) for value in reward]
     rows = np.column_stack([distance, silhouette, positions])
     head = (run.task, run.method, run.variant, run.seed, run.frames)

@@ -10,17 +10,17 @@ import numpy as np
 
 from pcil import envs, seeds
 from pcil.envs.rollout import Rollout
-from pcil.report.load import Collection, named
+from pcil.report.load import Collection, Track, named, quietly
 from pcil.seeds import Stream
 from pcil.training.evaluate import playable
 
 
-def films(found: Collection, trust: Sequence[str] = ()) -> dict[str, bytes]:
+def films(found: Collection, trust: Sequence[str] = (), track: Track = quietly) -> dict[str, bytes]:
     """Animations of the first seed of each task, method and variant, by title; one note covers those that can't be made."""
     first = {name[:3]: name for name in sorted(found.sources, reverse=True)}
     made: dict[str, bytes] = {}
     refused: list[str] = []
-    for name in sorted(first.values()):
+    for name in track(sorted(first.values()), "Animations"):
         try:
             made[f"{', '.join(name[:3])}, seed {name[3]}"] = film(found.sources[name].folder, trust)
         except Exception as error:  # OpenGL can raise anything where it does not work

@@ -26,6 +26,16 @@ UNREADABLE = (OSError, ValueError, LookupError, TypeError, ArithmeticError, Recu
 """The exceptions that reading a damaged file can raise."""
 
 
+Track = Callable[[Sequence[Any], str], Iterable[Any]]
+"""Goes through a sequence and shows the progress under a name."""
+
+
+def quietly(items: Sequence[Any], name: str) -> Iterable[Any]:
+    """A `Track` that shows nothing."""
+    del name
+    return items
+
+
 class EvalRow(NamedTuple):
     """One evaluation of one run; a row of `results/*.csv`."""
 

@@ -13,7 +13,7 @@ from pcil import compilation, envs, modules, seeds
 from pcil.errors import InputError
 from pcil.files import flat
 from pcil.report.embedding import project
-from pcil.report.load import Collection, EvalRow, Source, TransitionRow, named, sort_key
+from pcil.report.load import Collection, EvalRow, Source, Track, TransitionRow, named, quietly, sort_key
 from pcil.rewards import Reward
 from pcil.seeds import Stream
 from pcil.training import learner, runs, state
@@ -28,10 +28,10 @@ NUMBERS = 2**28
 """The largest number of parameters of a run that are restored: 1 GiB."""
 
 
-def add(found: Collection, trust: Sequence[str] = ()) -> None:
+def add(found: Collection, trust: Sequence[str] = (), track: Track = quietly) -> None:
     """Add rows to `found.transitions` for every run with a representation, and a note about runs whose networks can't be read.
 
-    `trust` are the modules that the runs' files may name.
+    `trust` are the modules that the runs' files may name; `track` shows the progress.
     """
     try:
         compilation.use_cache()
@@ -39,7 +39,7 @@ def add(found: Collection, trust: Sequence[str] = ()) -> None:
         found.notes.append(f"The representations are left out: {error}")
         return
     refused: list[str] = []
-    for name, source in found.sources.items():
+    for name, source in track(list(found.sources.items()), "Representations"):
         last = [row for row in found.rows if row[:4] == name][-1]
         try:
             found.transitions.extend(transitions(source, last, trust))

@@ -23,9 +23,9 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
-    "errors types seeds files modules compilation",
+    "errors types seeds files modules compilation card",
     "nets",
-    "envs demos policy rewards agents",
+    "envs demos policy rewards agents export",
     "training",
     "report theory bench",
     "sweep cli",

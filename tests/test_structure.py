@@ -126,6 +126,7 @@ def test_public_names_are_those_that_load() -> None:
         module, attribute = pcil._HOME[name]
         assert getattr(pcil, name) is getattr(sys.modules[module], attribute)
         assert getattr(pcil, name).__doc__, f"pcil.{name} has a docstring"
+    assert set(pcil.__all__) <= set(dir(pcil))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = pcil.nothing
 

@@ -11,7 +11,7 @@ from pcil.training.config import EnvKwargs
 
 
 def play(folder: Path, /, episodes: int = 10, seed: int = 0, env_kwargs: EnvKwargs | None = None, trust: Trust = ()) -> int:
-    """Show a trained policy at work in a window.
+    """Show a trained policy in a window.
 
     Tasks of DeepMind Control open MuJoCo's viewer, whose camera the mouse moves; other environments open their own window
     (render_mode="human"). Closing MuJoCo's window or Ctrl-C ends it. Where there is no display, pcil film makes a film.

@@ -248,6 +248,24 @@ def test_an_environment_that_gives_no_picture_is_named(
         assert why in refused(["film", "run", "--out", f"film{kind}"], capsys)
 
 
+@pytest.mark.parametrize("kind", [".gif", ".mp4"])
+def test_a_film_that_breaks_off_leaves_the_one_that_was_there(
+    kind: str, tmp_path: Path, clock: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Clock.render
+
+    def render(self: Clock) -> Any:
+        if self.time > 6:
+            raise RuntimeError("lost context")
+        return real(self)
+
+    monkeypatch.setattr(Clock, "render", render)
+    with_policy(tmp_path / "run", clock)
+    (tmp_path / f"film{kind}").write_text("earlier")
+    assert "lost context" in refused(["film", "run", "--out", f"film{kind}"], capsys)
+    assert (tmp_path / f"film{kind}").read_text() == "earlier"
+
+
 def test_a_missing_package_is_named(
     tmp_path: Path, clock: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -218,6 +218,8 @@ def test_the_example_agent_clones_the_expert_and_leaves_a_policy_that_loads(
     assert cli.main(words.split()) == 0 and "is done" in capsys.readouterr().out
     assert cli.main(["evaluate", "run"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
     assert cli.main(["evaluate", "run", "--episodes", "2", "--trust", "cloning_example"]) == 0
+    assert cli.main(["export", "run", "--out", "policy.onnx"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
+    assert cli.main(["export", "run", "--out", "policy.onnx", "--trust", "cloning_example"]) == 0
     policy, obs = pcil.load_policy("run", ["cloning_example"]), np.ones((3, 2), np.float32)
     assert (np.diag(policy.actor.weight) < -0.1).all(), "the expert moves towards the origin"
     assert np.allclose(policy(obs), np.tanh(obs @ policy.actor.weight)) and policy.spec[:2] == (2, 2)

@@ -232,6 +232,11 @@ def test_where_there_is_no_policy_the_sentence_says_what_to_give(folder: Path, m
     )
 
 
+def test_where_no_expert_ships_the_sentence_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pcil.policy.SHIPPED", tmp_path / "none")
+    assert "a task whose expert ships (none does)" in refusal(lambda: load_policy("walker_walk"))
+
+
 @pytest.mark.usefixtures("_as_users_run_it")
 @pytest.mark.parametrize("name", ["policy.safetensors", "policy.json"])
 def test_a_flipped_bit_is_refused_or_changes_no_action(folder: Path, name: str) -> None:

@@ -231,7 +231,7 @@ def test_a_film_that_can_not_be_made_is_refused(
         (None, "gave None as a picture"),
         (np.zeros((4, 4, 3)), "dtype float64"),
         (np.zeros((4, 4), np.uint8), "shape (4, 4)"),
-        (RuntimeError("no context"), "can't be drawn (RuntimeError: no context); pcil doctor"),
+        (RuntimeError("no context"), "can't be drawn (RuntimeError: no context); where it is MuJoCo's, pcil doctor"),
     ],
 )
 def test_an_environment_that_gives_no_picture_is_named(
@@ -246,6 +246,20 @@ def test_an_environment_that_gives_no_picture_is_named(
     with_policy(tmp_path / "run", clock)
     for kind in (".gif", ".mp4"):
         assert why in refused(["film", "run", "--out", f"film{kind}"], capsys)
+
+
+@pytest.mark.parametrize(("set_to", "found", "used"), [(None, "EGL", "egl"), (None, None, None), ("osmesa", "EGL", "osmesa")])
+def test_the_renderer_of_gymnasiums_own_environments_needs_no_display(
+    set_to: str | None, found: str | None, used: str | None, tmp_path: Path, clock: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr(Clock, "close", lambda self: seen.append(os.environ.get("MUJOCO_GL")), raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: found)
+    monkeypatch.setenv("MUJOCO_GL", set_to or "")
+    with_policy(tmp_path / "run", clock)
+    assert cli.main(["film", "run", "--out", "film.gif"]) == 0
+    assert seen == [used or ""]
 
 
 @pytest.mark.parametrize("kind", [".gif", ".mp4"])

@@ -1,6 +1,7 @@
 """`pcil film`."""
 
 import contextlib
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,8 @@ def film(
 ) -> int:
     """Film a trained policy, without a window or a display.
 
-    The environment must give pictures with render_mode="rgb_array". Tasks of DeepMind Control are drawn by the renderer that
-    MUJOCO_GL names (egl, osmesa, glfw), by default by EGL where it is installed, else by OSMesa.
+    The environment must give pictures with render_mode="rgb_array". Tasks of MuJoCo are drawn by the renderer that MUJOCO_GL
+    names (egl, osmesa, glfw), by default by EGL where it is installed.
 
     Args:
         folder: The folder of a run, one with policy.json and policy.safetensors, or a task whose expert ships.
@@ -40,6 +41,7 @@ def film(
         trust: Modules that the policy's files may name and whose code is then run, such as my.module.
     """
     from pcil import envs
+    from pcil.envs import dmc
     from pcil.report import film
     from pcil.training.evaluate import playable
 
@@ -52,7 +54,10 @@ def film(
         arguments.within(16, 4096, size=side)
     film.check_name(out)
     policy, played = playable(folder, env_kwargs, trust)
-    played = played | _looks(policy.task, size, camera)
+    ours = envs.gymnasium_id(policy.task).startswith("dmc/")
+    played = played | (_looks(size, camera) if ours else _looks(None, camera))
+    if not ours and not os.environ.get("MUJOCO_GL") and dmc.renderer() == "egl":
+        os.environ["MUJOCO_GL"] = "egl"  # Gymnasium's own environments of MuJoCo would look for a display
     drawn: dict[str, Any] = {"render_mode": "rgb_array", "env_kwargs": played}
     with contextlib.redirect_stdout(sys.stderr), envs.opened(policy.task, **drawn) as env:  # environments may print
         policy.check_fits(env)
@@ -62,13 +67,9 @@ def film(
     return 0
 
 
-def _looks(task: str, size: tuple[int, int] | None, camera: str | None) -> dict[str, Any]:
-    """The keyword arguments of the environment for the size, if it is one of ours, and for the camera."""
-    from pcil import envs
-
-    options: dict[str, Any] = (
-        {"width": size[0], "height": size[1]} if size and envs.gymnasium_id(task).startswith("dmc/") else {}
-    )
+def _looks(size: tuple[int, int] | None, camera: str | None) -> dict[str, Any]:
+    """The keyword arguments of an environment for the size and for the camera."""
+    options: dict[str, Any] = {"width": size[0], "height": size[1]} if size else {}
     if camera is not None:
         options["camera_id"] = int(camera) if camera.isdecimal() else camera
     return options

@@ -215,9 +215,7 @@ def import_suite() -> ModuleType:
 def enable_rendering() -> None:
     """Set dm_control's renderer to the one that `MUJOCO_GL` names, else to EGL or OSMesa, which need no display."""
     render: Any = importlib.import_module("dm_control._render")
-    name = os.environ.get("MUJOCO_GL", "").lower()
-    if not name:
-        name = "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
+    name = renderer()
     if name == "glfw" and not has_display():
         raise _no_opengl(name)
     if name == render.BACKEND and name in _RENDERERS:
@@ -227,6 +225,13 @@ def enable_rendering() -> None:
         render.Renderer, render.BACKEND = getattr(importlib.import_module(module), context), name
     except (KeyError, ImportError, AttributeError, OSError, RuntimeError) as error:
         raise _no_opengl(name) from error
+
+
+def renderer() -> str:
+    """The renderer that `MUJOCO_GL` names, else EGL or OSMesa on Linux, and GLFW elsewhere."""
+    if name := os.environ.get("MUJOCO_GL", "").lower():
+        return name
+    return "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
 
 
 def has_display() -> bool:

@@ -127,8 +127,8 @@ def _picture(env: envs.Checked, task: str) -> Image:
     except Exception as error:  # OpenGL can raise anything where it does not work
         why = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(".")
         raise InputError(
-            f"The environment {task!r} can't be drawn ({why}); pcil doctor says whether this machine can render, and "
-            "MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses another renderer for MuJoCo."
+            f"The environment {task!r} can't be drawn ({why}); where it is MuJoCo's, pcil doctor says whether this machine can "
+            "render, and MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses another renderer."
         ) from error
     array = np.asarray(picture)
     if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:

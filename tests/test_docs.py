@@ -18,10 +18,13 @@ import numpy as np
 import pytest
 
 import pcil
-from pcil import cli
+from pcil import cli, envs
 from pcil.agents import BC, DrQV2
 from pcil.cli import COMMANDS
 from pcil.demos import Demonstrations
+from pcil.envs.rollout import Rollout
+from pcil.nets.networks import Actor
+from pcil.policy import Policy
 from pcil.rewards import REWARDS, Reward, TaskReward
 from pcil.training import checkpoint, learner, presets
 from pcil.training.config import Run
@@ -215,9 +218,26 @@ def test_the_example_agent_clones_the_expert_and_leaves_a_policy_that_loads(
     assert cli.main(words.split()) == 0 and "is done" in capsys.readouterr().out
     assert cli.main(["evaluate", "run"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
     assert cli.main(["evaluate", "run", "--episodes", "2", "--trust", "cloning_example"]) == 0
+    assert cli.main(["export", "run", "--out", "policy.onnx"]) == 2 and "--trust cloning_example" in capsys.readouterr().err
+    assert cli.main(["export", "run", "--out", "policy.onnx", "--trust", "cloning_example"]) == 0
     policy, obs = pcil.load_policy("run", ["cloning_example"]), np.ones((3, 2), np.float32)
     assert (np.diag(policy.actor.weight) < -0.1).all(), "the expert moves towards the origin"
     assert np.allclose(policy(obs), np.tanh(obs @ policy.actor.weight)) and policy.spec[:2] == (2, 2)
+
+
+def test_the_ten_lines_run_an_exported_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They end where the policy itself ends, up to rounding."""
+    policy = Policy(Actor.init(3, 1, 4, 8, key=jax.random.key(0)), "Pendulum-v1")
+    pcil.export_onnx(policy, "policy.onnx")
+    (text,) = blocks(ROOT / "docs" / "deploy.md", "python")
+    assert len([line for line in text.splitlines() if line]) == 10
+    exec(compile(text, "deploy.md", "exec"), ran := {})
+    rollout = Rollout([envs.make("Pendulum-v1")], [0], ["the same"])
+    while rollout.playing:
+        rollout.step([policy(rollout.obs[0])])
+    assert ran["over"] and np.allclose(ran["obs"], rollout.obs[0], atol=1e-2)
+    about = ran["session"].get_modelmeta().custom_metadata_map
+    assert about["task"] == "Pendulum-v1" and json.loads(about["action_high"]) == [2.0]
 
 
 def test_the_page_of_the_command_line_is_fresh(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,9 +83,9 @@ def test_a_run_folder_is_as_good_as_its_policy_folder(saved: Path) -> None:
         assert load_policy(path).task == "walker_walk"
 
 
-def test_saving_again_replaces_and_leaves_two_files(folder: Path) -> None:
+def test_saving_again_replaces_and_leaves_three_files(folder: Path) -> None:
     make_policy(seed=1).save(folder)
-    assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "policy.json"}
+    assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "policy.json", "README.md"}
     np.testing.assert_array_equal(load_policy(folder).actor.trunk.weight, make_policy(seed=1).actor.trunk.weight)
 
 
@@ -94,7 +94,7 @@ def test_a_save_that_fails_leaves_the_policy_that_was_there(folder: Path) -> Non
     with pytest.raises(TypeError):
         Policy(other.actor, other.task, {"not json": object()}).save(folder)
     np.testing.assert_array_equal(load_policy(folder).actor.trunk.weight, make_policy().actor.trunk.weight)
-    assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "policy.json"}
+    assert {path.name for path in folder.iterdir()} == {"policy.safetensors", "policy.json", "README.md"}
 
 
 def test_the_files_hold_numbers_and_text_and_no_code(saved: Path) -> None:
@@ -226,7 +226,15 @@ def test_where_there_is_no_policy_the_sentence_says_what_to_give(folder: Path, m
     path = folder / "nowhere" if missing is None else folder
     (folder / (missing or "policy.json")).unlink()
     message = refusal(lambda: load_policy(path))
-    assert re.fullmatch(rf"{re.escape(str(path))} holds no policy \(.*\); give a run folder that pcil train made\.", message)
+    known = r"a task whose expert ships \(acrobot_swingup, .*, walker_walk\)\."
+    assert re.fullmatch(
+        rf"{re.escape(str(path))} holds no policy \(.*\); give a run folder that pcil train made, or {known}", message
+    )
+
+
+def test_where_no_expert_ships_the_sentence_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pcil.policy.SHIPPED", tmp_path / "none")
+    assert "a task whose expert ships (none does)" in refusal(lambda: load_policy("walker_walk"))
 
 
 @pytest.mark.usefixtures("_as_users_run_it")

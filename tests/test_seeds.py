@@ -36,6 +36,7 @@ def test_the_streams_numbers_stay_what_they_were() -> None:
         "EVALUATE": 7,
         "RECORD": 8,
         "CLONE": 9,
+        "NOISE": 10,
     }
 
 

@@ -23,9 +23,9 @@ ROOT = Path(__file__).parent.parent
 SOURCES = sorted(PACKAGE.rglob("*.py"))
 LONGEST = 350
 LAYERS = [
-    "errors types seeds files modules compilation",
+    "errors types seeds files modules compilation card",
     "nets",
-    "envs demos policy rewards agents",
+    "envs demos policy rewards agents export",
     "training",
     "report theory bench",
     "sweep cli",
@@ -126,6 +126,7 @@ def test_public_names_are_those_that_load() -> None:
         module, attribute = pcil._HOME[name]
         assert getattr(pcil, name) is getattr(sys.modules[module], attribute)
         assert getattr(pcil, name).__doc__, f"pcil.{name} has a docstring"
+    assert set(pcil.__all__) <= set(dir(pcil))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = pcil.nothing
 

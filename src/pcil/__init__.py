@@ -19,6 +19,7 @@ __all__ = [
     "Policy",
     "Reward",
     "RunError",
+    "export_onnx",
     "load_policy",
     "make_env",
     "record",
@@ -34,6 +35,7 @@ _HOME = {
     "Policy": ("pcil.policy", "Policy"),
     "Reward": ("pcil.rewards", "Reward"),
     "RunError": ("pcil.errors", "RunError"),
+    "export_onnx": ("pcil.export", "export_onnx"),
     "load_policy": ("pcil.policy", "load_policy"),
     "make_env": ("pcil.envs", "make"),
     "record": ("pcil.demos", "record"),
@@ -46,3 +48,8 @@ def __getattr__(name: str):
         raise AttributeError(f"module 'pcil' has no attribute {name!r}")
     module, attribute = _HOME[name]
     return getattr(importlib.import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    """The public names, also those that are not loaded yet."""
+    return sorted({*globals(), *__all__} - {"importlib"})

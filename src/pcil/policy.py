@@ -14,11 +14,14 @@ import jax
 import numpy as np
 
 from pcil import files, modules
+from pcil.card import card
 from pcil.errors import InputError
 from pcil.nets.networks import MLP, Actor, Normalizer, Trunk
 from pcil.types import Spec
 
 FORMAT = "pcil-policy-1"
+SHIPPED = Path(__file__).parent / "data" / "policies"
+"""The experts that the package has, each in a folder named after its task."""
 LARGEST = 2**30
 """The largest `policy.safetensors` in bytes."""
 
@@ -48,6 +51,13 @@ class Policy:
         """The keyword arguments of the environment in which it was trained."""
         return self.info.get("env_kwargs", {})
 
+    @property
+    def action_bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The bounds `[action]` of its environment's own actions, to which -1 and 1 correspond; None in older policies."""
+        if self.info.get("action_low") is None:
+            return None
+        return np.array(self.info["action_low"], np.float64), np.array(self.info["action_high"], np.float64)
+
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         obs = np.asarray(obs, np.float32)
         if obs.shape[-1:] != (self.spec.obs_dim,):
@@ -69,9 +79,9 @@ class Policy:
             )
 
     def save(self, folder: Path) -> None:
-        """Write `policy.json` and `policy.safetensors` to `folder`, each atomically.
+        """Write `policy.json`, `policy.safetensors` and the model card `README.md` to `folder`, each atomically.
 
-        `policy.safetensors` has checksums of its own arrays and of `policy.json`.
+        `policy.safetensors` has checksums of its own arrays and of `policy.json`. The card repeats what `policy.json` says.
         """
         folder.mkdir(parents=True, exist_ok=True)
         arrays = _named(self.actor)
@@ -85,11 +95,13 @@ class Policy:
                 )
             kind = {"class": named, "sizes": [self.spec.obs_dim, self.spec.action_dim]}
         text = json.dumps({"format": FORMAT, "task": self.task, **kind, "info": self.info}) + "\n"
+        readme = card(self.task, self.info)
         # A single entry, since safetensors writes several ones in random order.
         checksums = f"{_digest(arrays)} {hashlib.sha256(text.encode()).hexdigest()}"
         files.save_arrays(folder / "policy.safetensors.tmp", arrays, {"sha256": checksums})
         (folder / "policy.json.tmp").write_text(text)
-        for name in ("policy.safetensors", "policy.json"):
+        (folder / "README.md.tmp").write_text(readme, encoding="utf-8")
+        for name in ("policy.safetensors", "policy.json", "README.md"):
             (folder / f"{name}.tmp").replace(folder / name)
 
 
@@ -106,18 +118,21 @@ def as_saved(folder: Path) -> bool:
 
 
 def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
-    """The policy of a run folder, or of a folder that holds `policy.safetensors` and `policy.json`.
+    """The policy of a run folder, of a folder that holds `policy.safetensors` and `policy.json`, or the expert that ships for a
+    task ("walker_walk") where there is no such folder.
 
     `trust` are the modules that it may name for an actor that is not part of this package. `InputError` if there is no policy
     or if its files are damaged.
     """
     from safetensors import SafetensorError
 
-    folder = Path(path)
+    folder, shipped = Path(path), sorted(file.parent.name for file in SHIPPED.glob("*/policy.json"))
+    folder = SHIPPED / str(path) if str(path) in shipped and not folder.exists() else folder
     folder = folder / "policy" if (folder / "policy").is_dir() else folder
     if not (folder / "policy.json").is_file() or not (folder / "policy.safetensors").is_file():
         raise InputError(
-            f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made."
+            f"{path} holds no policy (policy.json and policy.safetensors); give a run folder that pcil train made, or "
+            f"a task whose expert ships ({', '.join(shipped) or 'none does'})."
         )
     try:
         header = files.read_json(folder / "policy.json")
@@ -173,6 +188,11 @@ def _check_header(header: dict[str, Any]) -> None:
         raise ValueError("its task is no name or its info no table")
     if not isinstance(header.get("info", {}).get("env_kwargs", {}), dict):
         raise ValueError("its env_kwargs are no table")
+    bounds = [header.get("info", {}).get(f"action_{end}") for end in ("low", "high")]
+    if bounds != [None, None]:
+        low, high = np.array(bounds, np.float64)
+        if low.ndim != 1 or not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+            raise ValueError("its action_low and action_high are no lists of numbers, each below its counterpart")
 
 
 def _build(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Actor:

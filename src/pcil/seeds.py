@@ -32,6 +32,8 @@ class Stream(enum.IntEnum):
     """Resets while demonstrations are recorded; the counter is the attempt."""
     CLONE = 9
     """Samples for behavioural cloning before the first update; the counter is 0."""
+    NOISE = 10
+    """Noise of an evaluation; the counter is the index of the evaluation episode."""
 
 
 def key(root: Any, stream: Stream, counter: Any) -> Any:

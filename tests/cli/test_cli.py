@@ -12,6 +12,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -422,6 +423,71 @@ def test_evaluate_prints_json_and_nothing_else(run: Path, capsys: pytest.Capture
     assert capsys.readouterr().out.startswith(
         f"{POINT_MASS}: return {row['return_mean']:.1f} +- {row['return_std']:.1f} over 3"
     )
+
+
+class Heavy(PointMass):
+    """A point mass at which the same action moves less, and which says whether it came near."""
+
+    def __init__(self, speed: float = 0.05) -> None:
+        super().__init__()
+        self.SPEED = speed
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        *result, _ = super().step(action)
+        return *result, {"is_success": bool(result[1] > 0.5)}
+
+
+@pytest.fixture
+def heavy() -> Iterator[str]:
+    gymnasium.register(name := "test/heavy-v0", Heavy, disable_env_checker=True)
+    yield name
+    del gymnasium.registry[name]
+
+
+def evaluated(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+    assert cli.main(["evaluate", *words, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_another_environment_has_its_own_arguments(run: Path, heavy: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the speed of the point mass it pays the same, and half of it pays something else; the policy's own stay away."""
+    policy = load_policy(run)
+    dataclasses.replace(policy, info=policy.info | {"env_kwargs": {"max_episode_steps": 7}}).save(run / "policy")
+    plain = evaluated(capsys, "run", "--episodes", "3", "--env", POINT_MASS)
+    same = evaluated(capsys, "run", "--episodes", "3", "--env", heavy, "--env-kwargs", '{"speed": 0.1}')
+    slow = evaluated(capsys, "run", "--episodes", "3", "--env", heavy)
+    assert same["returns"] == plain["returns"] != slow["returns"]
+    assert same.pop("success_rate") in (0, 1 / 3, 2 / 3, 1) and "success_rate" not in plain
+    known = ["task", "episodes", "seed", "return_mean", "return_std", "return_min", "returns", "trained_on"]
+    assert list(same) == list(plain) == known and (slow["task"], slow["trained_on"]) == (heavy, POINT_MASS)
+    assert cli.main(["evaluate", "run", "--env", heavy]) == 0
+    assert capsys.readouterr().out.startswith(f"{heavy}: return ")
+    assert "but in the environment created here" in refused(["evaluate", "run", "--env", "toy/probe_1-v0"], capsys)
+    assert "There is no environment 'nothing'" in refused(["evaluate", "run", "--env", "nothing"], capsys)
+
+
+@pytest.mark.usefixtures("run")
+def test_noise_changes_the_returns_and_is_the_same_each_time(capsys: pytest.CaptureFixture[str]) -> None:
+    exact, noisy, again, single = (
+        evaluated(capsys, "run", "--episodes", "3", *words.split())
+        for words in ("--noise 0", "--noise 0.3", "--noise 0.3", "--noise 0.3 --single-environment")
+    )
+    assert noisy == again == single and noisy["noise"] == 0.3
+    assert "noise" not in exact and not set(noisy["returns"]) & set(exact["returns"])
+    for value in ("-0.1", "nan", "inf"):
+        assert "it must be at least 0" in refused(["evaluate", "run", f"--noise={value}"], capsys)
+
+
+def test_an_expert_that_ships_is_found_by_its_task(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    row = evaluated(capsys, "pendulum_swingup", "--episodes", "1")
+    assert row["task"] == "pendulum_swingup" and row["return_mean"] > 300
+    assert pcil.load_policy("walker_walk").info["method"] == "expert"
+    assert cli.main(["record", "pendulum_swingup", "--episodes", "1", "--out", "mine/p-v0"]) == 0
+    capsys.readouterr()
+    run.rename(tmp_path / "walker_walk")  # a folder of this name comes first
+    assert pcil.load_policy("walker_walk").task == POINT_MASS
+    said = refused(["evaluate", "walker_wlak"], capsys)
+    assert "holds no policy" in said and all(task in said for task in TASKS)
 
 
 def test_what_is_recorded_can_be_trained_from(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

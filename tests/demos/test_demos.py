@@ -631,3 +631,12 @@ def test_a_bad_recording_is_refused() -> None:
         assert "need actions in a Box with finite bounds" in unbounded
     broken = refusal(lambda: demos.record(push, Odd(episode=2, reward=np.nan), 3, **options))
     assert "recorded episode 2" in broken
+
+
+def test_the_repr_is_one_short_line() -> None:
+    """Two episodes of two steps, with returns 3 and 5."""
+    obs, actions = [np.zeros((3, 2))] * 2, [np.zeros((2, 1))] * 2
+    full = Demonstrations.from_arrays(obs, actions, [np.array([1.0, 2.0]), np.array([2.0, 3.0])], task="mine")
+    assert repr(full) == "Demonstrations('mine': 2 episodes, 4 steps, return 4.0 +- 1.0)"
+    assert repr(Demonstrations.from_arrays(obs, actions)) == "Demonstrations('arrays': 2 episodes, 4 steps)"
+    assert repr(dataclasses.replace(full, episodes=())) == "Demonstrations('mine': 0 episodes, 0 steps)"

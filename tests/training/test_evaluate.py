@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pcil.errors import InputError
-from pcil.seeds import Stream, episode_seed
+from pcil.seeds import Stream, episode_seed, rng
 from pcil.training.evaluate import LOCKSTEP, Evaluation, environments_for, evaluate
 
 
@@ -147,6 +147,39 @@ def test_fewer_environments_than_episodes_take_them_in_turns() -> None:
     for episodes, single, copies in ((1000, False, LOCKSTEP), (2, False, 2), (2, True, 1)):
         with environments_for("toy/point_mass-v0", episodes, single=single) as (_, made):
             assert len(made) == copies
+
+
+class Noting(Walk):
+    """Notes the actions that it is given."""
+
+    def __init__(self, length: int) -> None:
+        super().__init__(length)
+        self.actions: list[float] = []
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.actions.append(float(action[0]))
+        return super().step(action)
+
+
+def test_noise_is_gaussian_clipped_and_of_its_episode() -> None:
+    """The second implementation draws the noise of an episode at once, from the generator with its number."""
+    still, noise = lambda obs: np.full((len(obs), 1), 0.25, np.float32), 0.6
+    side_by_side = [Noting(40) for _ in range(5)]
+    result = evaluate(still, side_by_side, seed=3, noise=noise)
+    for i, env in enumerate(side_by_side):
+        drawn = rng(3, Stream.NOISE, i).normal(size=40)
+        np.testing.assert_allclose(env.actions, np.clip(0.25 + noise * drawn, -1, 1), atol=1e-6)
+        assert max(env.actions) == 1 and min(env.actions) >= -1
+    one = Noting(40)
+    alone = evaluate(still, [one], seed=3, episodes=5, noise=noise)
+    assert one.actions == [action for env in side_by_side for action in env.actions]
+    assert alone.returns.tolist() == result.returns.tolist()
+
+
+def test_without_noise_actions_are_those_of_the_policy() -> None:
+    env = Noting(3)
+    evaluate(lambda obs: np.full((len(obs), 1), 0.25, np.float32), [env], seed=0, episodes=1, noise=0.0)
+    assert env.actions == [0.25] * 3
 
 
 def test_an_environment_may_reuse_its_buffer() -> None:

@@ -126,6 +126,8 @@ CHECKS: tuple[Check, ...] = (
     ("figures", _importable("matplotlib", "matplotlib"), "pip install '.[report]' in a clone", False),
     ("optimal transport", _importable("ot", "pot"), "pip install --force-reinstall pot", False),
     ("Ray clusters", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
+    ("ONNX", _importable("onnxruntime", "onnxruntime"), "pip install '.[onnx]' in a clone", False),
+    ("MP4 films", _importable("imageio_ffmpeg", "imageio-ffmpeg"), "pip install '.[film]' in a clone", False),
     ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
 )
 

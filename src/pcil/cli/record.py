@@ -23,7 +23,7 @@ def record(
     """Record demonstrations from a trained policy, as a Minari dataset.
 
     Args:
-        folder: The folder of a run, or one with policy.json and policy.safetensors.
+        folder: The folder of a run, one with policy.json and policy.safetensors, or a task whose expert ships.
         out: The dataset's folder; it must not exist.
         episodes: The number of episodes.
         seed: The seed of the initial states.

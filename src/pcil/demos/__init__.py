@@ -88,6 +88,10 @@ class Demonstrations:
             )
         return loaded
 
+    def __repr__(self) -> str:
+        paid = f", return {self.return_mean:.1f} +- {self.return_std:.1f}" if self.has_rewards and self.episodes else ""
+        return f"Demonstrations({self.task!r}: {len(self.episodes)} episodes, {self.num_steps} steps{paid})"
+
     @property
     def num_steps(self) -> int:
         """The total number of agent steps, which is the number of rows of `obs` and `action`."""

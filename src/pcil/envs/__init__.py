@@ -130,7 +130,7 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
         raise InputError(f"The environment of this run was given in Python ({task}), so it can't be made by name.")
     register()
     arguments = json_object("env_kwargs", env_kwargs or {})
-    env_id = _gymnasium_id(task)
+    env_id = gymnasium_id(task)
     if render_mode is not None and env_id.startswith("toy/"):
         raise InputError(f"{task!r} has no pictures; render_mode must be None.")
     if "task" in arguments and env_id.startswith("dmc/"):
@@ -208,7 +208,7 @@ class _RescaleAction(wrappers.RescaleAction):
     """A class of its own, to tell our wrapper from one that the environment was registered with."""
 
 
-def _gymnasium_id(task: str) -> str:
+def gymnasium_id(task: str) -> str:
     """The registered id for a name. Tasks of the DeepMind Control suite beyond the ten are registered on demand."""
     name = task_name(task)
     if dmc_id(name) in gymnasium.registry:

@@ -136,6 +136,11 @@ class DMCEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         with _model_warnings_suppressed():
             self._env = env = import_suite().load(self._domain, self._task, task_kwargs={"random": random})
+        screen = self.physics.model.vis.global_  # what is drawn may not be larger
+        screen.offwidth, screen.offheight = (
+            max(screen.offwidth, self._camera["width"]),
+            max(screen.offheight, self._camera["height"]),
+        )
         self.num_substeps: int = env._n_sub_steps  # dm_control has no public attribute for this and the limit
         self._frame_limit: float = env._step_limit
         self._fill_observation, self._reward = (views_for(self.name) or generic_views)(env)
@@ -210,9 +215,9 @@ def import_suite() -> ModuleType:
 def enable_rendering() -> None:
     """Set dm_control's renderer to the one that `MUJOCO_GL` names, else to EGL or OSMesa, which need no display."""
     render: Any = importlib.import_module("dm_control._render")
-    name = os.environ.get("MUJOCO_GL", "").lower()
-    if not name:
-        name = "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
+    name = renderer()
+    if name == "glfw" and not has_display():
+        raise _no_opengl(name)
     if name == render.BACKEND and name in _RENDERERS:
         return
     try:
@@ -220,6 +225,18 @@ def enable_rendering() -> None:
         render.Renderer, render.BACKEND = getattr(importlib.import_module(module), context), name
     except (KeyError, ImportError, AttributeError, OSError, RuntimeError) as error:
         raise _no_opengl(name) from error
+
+
+def renderer() -> str:
+    """The renderer that `MUJOCO_GL` names, else EGL or OSMesa on Linux, and GLFW elsewhere."""
+    if name := os.environ.get("MUJOCO_GL", "").lower():
+        return name
+    return "glfw" if sys.platform in ("darwin", "win32") else "egl" if ctypes.util.find_library("EGL") else "osmesa"
+
+
+def has_display() -> bool:
+    """Whether a window may be opened: on Linux, whether the environment names a display."""
+    return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _no_opengl(name: str) -> InputError:

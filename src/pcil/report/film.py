@@ -1,18 +1,31 @@
-"""Short animations of policies, if the machine can render."""
+"""Animations of policies, if the machine can render: short ones for reports, and those of `pcil film`."""
 
 from __future__ import annotations
 
+import contextlib
 import io
-from collections.abc import Sequence
+import itertools
+import os
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcil import envs, seeds
 from pcil.envs.rollout import Rollout
+from pcil.errors import InputError, brief
+from pcil.policy import Policy
 from pcil.report.load import Collection, Track, named, quietly
 from pcil.seeds import Stream
 from pcil.training.evaluate import playable
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+KINDS = (".gif", ".mp4")
+"""What the name of a film may end in."""
 
 
 def films(found: Collection, trust: Sequence[str] = (), track: Track = quietly) -> dict[str, bytes]:
@@ -35,20 +48,127 @@ def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int =
 
     `trust` are the modules that the run's files may name.
     """
-    from PIL import Image
-
     policy, env_kwargs = playable(folder, None, trust)
     with envs.opened(policy.task, render_mode="rgb_array", env_kwargs=env_kwargs) as env:
         policy.check_fits(env)
-        rollout = Rollout(
-            [env], [seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)], ["the filmed episode"], keep=False
-        )
-        frames = []
-        while rollout.playing and rollout.lengths[0] < steps:
-            if rollout.lengths[0] % every == 0:
-                frames.append(Image.fromarray(np.asarray(env.render())))
-            rollout.step([policy(rollout.obs[0])])
-        milliseconds = round(1000 * every / env.unwrapped.metadata.get("render_fps", 30))
-    file = io.BytesIO()
-    frames[0].save(file, "WEBP", save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, quality=50)
+        start = seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)
+        file = io.BytesIO()
+        _save(itertools.islice(pictures(policy, env, [start], every), -(-steps // every)), file, "WEBP", every / _rate(env))
     return file.getvalue()
+
+
+def write(
+    policy: Policy, env: envs.Checked, out: Path, *, episodes: int, seed: int, fps: float, size: tuple[int, int] | None = None
+) -> tuple[int, list[float]]:
+    """Film the first `episodes` evaluation episodes of `seed` in an environment whose `render_mode` is "rgb_array".
+
+    The film shows real time, with about `fps` pictures a second, at most one for each agent step. Pictures that are not of
+    `size` (width, height) are scaled. Returns the number of pictures and the return of each episode. `InputError` if the
+    environment gives no pictures; then there is no file.
+    """
+    from PIL.Image import Dither
+
+    every, returns, count = max(1, round(_rate(env) / fps)), [], 0
+
+    def counted(images: Iterator[Image]) -> Iterator[Image]:
+        nonlocal count
+        for count, image in enumerate(images, start=1):  # noqa: B007
+            image = image if size in (None, image.size) else image.resize(size)
+            yield image.quantize(128, dither=Dither.NONE) if out.suffix == ".gif" else image  # smaller than dithered
+
+    starts = [seeds.episode_seed(seed, Stream.EVALUATE, i) for i in range(episodes)]
+    images = counted(pictures(policy, env, starts, every, returns))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{os.getpid()}.{out.name}")
+    try:
+        if out.suffix == ".gif":
+            _save(images, partial, "GIF", every / _rate(env))
+        else:
+            _save_mp4(images, partial, _rate(env) / every)
+        partial.replace(out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return count, returns
+
+
+def check_name(out: Path) -> None:
+    """`InputError` if a film can't be written under this name: because of its ending, or of a package that is missing."""
+    if out.suffix not in KINDS or out.is_dir():
+        raise InputError(f"The film can't be written to {out}; give a file whose name ends in {' or '.join(KINDS)}.")
+    try:
+        import PIL.Image  # noqa: F401
+
+        if out.suffix == ".mp4":
+            import imageio_ffmpeg  # noqa: F401
+    except ImportError as error:
+        gif = "" if out.suffix == ".gif" else ", and a film whose name ends in .gif needs only Pillow"
+        raise InputError(f"A film needs {error.name}, which pip install '.[film]' in a clone brings{gif}.") from error
+
+
+def pictures(
+    policy: Policy, env: envs.Checked, starts: Sequence[int], every: int, returns: list[float] | None = None
+) -> Iterator[Image]:
+    """A picture before each `every`-th agent step of an episode from each of the seeds; `returns` is given their returns."""
+    for number, start in enumerate(starts, start=1):
+        rollout = Rollout([env], [start], [f"filmed episode {number}"], keep=False)
+        while rollout.playing:
+            if rollout.lengths[0] % every == 0:
+                yield _picture(env, policy.task)
+            rollout.step([policy(rollout.obs[0])])
+        if returns is not None:
+            returns.append(float(rollout.returns[0]))
+
+
+def _picture(env: envs.Checked, task: str) -> Image:
+    from PIL import Image
+
+    try:
+        picture = env.render()
+    except Exception as error:  # OpenGL can raise anything where it does not work
+        why = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(".")
+        raise InputError(
+            f"The environment {task!r} can't be drawn ({why}); where it is MuJoCo's, pcil doctor says whether this machine can "
+            "render, and MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses another renderer."
+        ) from error
+    array = np.asarray(picture)
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3:
+        raise InputError(
+            f"The environment {task!r} gave {brief(picture)} as a picture; with render_mode='rgb_array' it must give an array "
+            "[height, width, 3] of uint8."
+        )
+    return Image.fromarray(array)
+
+
+def _rate(env: envs.Checked) -> float:
+    """Agent steps in a second of the environment's time, as its metadata says; 30 where it does not."""
+    rate = (env.unwrapped.metadata or {}).get("render_fps")
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else 30.0
+
+
+def _save(images: Iterable[Image], file: Any, kind: str, seconds: float) -> None:
+    """An animation with so many seconds for each picture, which is repeated for ever."""
+    images = iter(images)
+    first = next(images)
+    options = {"quality": 50} if kind == "WEBP" else {}
+    first.save(file, kind, save_all=True, append_images=images, duration=round(1000 * seconds), loop=0, **options)
+
+
+def _save_mp4(images: Iterator[Image], file: Path, fps: float) -> None:
+    """An H.264 film, by the ffmpeg of imageio-ffmpeg. Its own writer would fork this process, in which JAX has threads."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    first = next(images)
+    width, height = (length - length % 2 for length in first.size)  # two by two pixels have one colour in H.264
+    given = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {fps} -i -".split()
+    wanted = ["-an", "-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command = [get_ffmpeg_exe(), "-loglevel", "error", "-y", *given, *wanted, str(file)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended, and says why
+            for image in itertools.chain([first], images):
+                process.stdin.write(np.asarray(image)[:height, :width].tobytes())
+        with contextlib.suppress(BrokenPipeError):
+            process.stdin.close()
+        said = process.stderr.read().decode(errors="replace")
+    if process.returncode:
+        raise InputError(f"The film {file.name} can't be written (ffmpeg: {' '.join(said.split()) or process.returncode}).")

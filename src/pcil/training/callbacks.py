@@ -139,6 +139,11 @@ class LogFiles(Callback):
         rows = [json.loads(line) for line in held["train.jsonl"].splitlines()]
         return History(rows, list(csv.DictReader(io.StringIO(held["eval.csv"]))), seconds, demos_return)
 
+    def last_returns(self) -> list[float]:
+        """The return of each episode of the last evaluation."""
+        rows = list(csv.DictReader(io.StringIO(self.contents()["eval.csv"])))
+        return [float(row["return"]) for row in rows if row["frames"] == rows[-1]["frames"]]
+
     def episode(self, row: dict[str, Any]) -> None:
         self._write("train.jsonl", json.dumps(row) + "\n")
 

@@ -17,7 +17,7 @@ from pcil.envs.checked import real_numbers
 from pcil.envs.rollout import Rollout
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
-from pcil.seeds import Stream, episode_seed
+from pcil.seeds import Stream, episode_seed, rng
 
 LOCKSTEP = 32
 """Maximum number of episodes that are played at once."""
@@ -47,15 +47,22 @@ class Evaluation:
         return self.info["is_success"].tolist() if "is_success" in self.info else None
 
 
-def playable(folder: Path, env_kwargs: dict[str, Any] | None, trust: Sequence[str]) -> tuple[Policy, dict[str, Any]]:
-    """The policy of a folder and its environment's keyword arguments, by default those it was trained with.
+def playable(
+    folder: Path, env_kwargs: dict[str, Any] | None, trust: Sequence[str], task: str | None = None
+) -> tuple[Policy, dict[str, Any]]:
+    """The policy of a folder and the keyword arguments of the environment to play in: `task` with `env_kwargs`, by default that
+    of the training.
 
-    `InputError` where these files name a module that is not among those to `trust`.
+    `InputError` where the policy's files name a module that is not among those to `trust`.
     """
     policy = load_policy(folder, trust)
-    modules.admit(f"The policy in {folder}", modules.of_task(policy.task, env_kwargs is None and policy.env_kwargs), trust)
+    if task is None:
+        modules.admit(f"The policy in {folder}", modules.of_task(policy.task, env_kwargs is None and policy.env_kwargs), trust)
+    else:
+        modules.admit("--env", modules.of_task(task), None)
     modules.admit("--env-kwargs", modules.of_task("", env_kwargs), None)
-    return policy, policy.env_kwargs if env_kwargs is None else env_kwargs
+    known = policy.env_kwargs if task is None else {}
+    return policy, known if env_kwargs is None else env_kwargs
 
 
 @contextlib.contextmanager
@@ -87,6 +94,7 @@ def evaluate(
     *,
     seed: int,
     episodes: int | None = None,
+    noise: float = 0.0,
 ) -> Evaluation:
     """So many episodes, by default one in each of `environments`, as many at once as there are of these.
 
@@ -95,6 +103,7 @@ def evaluate(
     episodes are played all at once or one by one.
 
     Episode `i` starts from a seed that depends on `seed` and `i` alone, so every evaluation of a run meets the same starts.
+    So does the `noise` of its actions: Gaussian with this standard deviation, after which they are clipped to [-1, 1].
     """
     begin = time.perf_counter()
     checked = [envs.checked(env) for env in environments]
@@ -108,12 +117,18 @@ def evaluate(
             rows, part = np.zeros((len(block), envs.spec(checked[0]).obs_dim), np.float32), slice(start - first, None)
             starts = [episode_seed(seed, Stream.EVALUATE, i) for i in numbers]
             names = [f"evaluation episode {i + 1}" for i in numbers]
-            rollout = Rollout(checked[: len(numbers)], starts, names, keep=False)
+            rollout, rngs = (
+                Rollout(checked[: len(numbers)], starts, names, keep=False),
+                [rng(seed, Stream.NOISE, i) for i in numbers],
+            )
             while rollout.playing:
                 rows[part][: len(numbers)] = rollout.obs
                 if len(actions := act(rows)) != len(rows):
                     raise ValueError(f"{len(actions)} actions for {len(rows)} observations")
-                rollout.step(actions[part])
+                actions = actions[part][: len(numbers)]
+                for i in rollout.playing if noise else ():
+                    actions[i] = np.clip(actions[i] + noise * rngs[i].normal(size=actions[i].shape), -1, 1)
+                rollout.step(actions)
             returns[start : numbers.stop], lengths[start : numbers.stop] = rollout.returns, rollout.lengths
             infos += map(_scalars, rollout.info)
     return Evaluation(returns, lengths, time.perf_counter() - begin, _columns(infos))

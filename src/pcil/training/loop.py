@@ -57,7 +57,7 @@ def train_loop(
         told.begin(run, folder, log.history(clock.total(), demos_return))
 
         if state.counters.final_return is not None:
-            states.save_policy(run, folder, state, spec, state.counters.final_return)
+            states.save_policy(run, folder, state, training[0], state.counters.final_return, log.last_returns())
         saved = clock.total()
         while state.counters.final_return is None:
             with states.saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
@@ -65,7 +65,7 @@ def train_loop(
                     result = evaluate(state.policy(run), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
                     told.evaluation(state.counters.frames, clock.total(), result)
                     state.counters = states.evaluated(run, state.counters, result.mean, demos_return)
-                    states.save_policy(run, folder, state, spec, result.mean)
+                    states.save_policy(run, folder, state, training[0], result.mean, log.last_returns())
                     if state.counters.final_return is not None:
                         if state.counters.frames < run.frames:
                             told.message(

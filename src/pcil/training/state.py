@@ -7,7 +7,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import jax
@@ -191,15 +191,21 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
     return State(restored, actor, fresh.replay, fresh.expert, counters), logs
 
 
-def save_policy(run: Run, folder: Path, state: State, spec: Spec, return_mean: float) -> None:
-    """Write the current policy to the run's folder, with its provenance."""
+def save_policy(run: Run, folder: Path, state: State, env: envs.Checked, return_mean: float, returns: Sequence[float]) -> None:
+    """Write the current policy to the run's folder, with its provenance; `returns` are those of its evaluation."""
+    spec, box, demos = envs.spec(env), envs.origin(env), PurePath(run.demos or envs.task_name(run.task))
     info = {
         "method": run.method,
         "preset": run.preset,
         "seed": run.seed,
         "frames": state.counters.frames,
         "return_mean": return_mean,
+        "return_std": float(np.std(returns)) if returns else None,
+        "return_episodes": len(returns),
+        "demos": (demos.name if demos.is_absolute() else str(demos)) if run.needs_demos else None,
         "action_repeat": spec.action_repeat,
+        "action_low": box.action_low,
+        "action_high": box.action_high,
         "env_kwargs": run.env_kwargs,
     }
     Policy(state.saved_actor(run), envs.task_name(run.task), info, spec).save(folder / "policy")

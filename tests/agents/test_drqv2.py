@@ -208,10 +208,12 @@ def test_cloning_takes_a_step_towards_the_demonstrated_actions_of_the_actor_alon
     assert all(same)
 
 
-def test_the_absorbing_state_has_no_action_to_clone() -> None:
+@pytest.mark.parametrize("every", [1, 2, 32])
+def test_the_absorbing_state_has_no_action_to_clone(every: int) -> None:
+    """If all windows but the last begin in it, the last one alone decides."""
     agent = dataclasses.replace(ABSORBING, cloning=True)
     state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
-    ends = jnp.arange(32) % 2 == 0
+    ends = jnp.arange(1, 33) % every != 0
     window = window._replace(obs=window.obs.at[:, 0, -1].set(jnp.where(ends, 1.0, 0.0)))
     alive = window._replace(obs=window.obs[~ends], action=window.action[~ends])
     other = window._replace(action=jnp.where(ends[:, None, None], -window.action, window.action))

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from pcil.errors import InputError
 from pcil.report import figures  # chooses the backend of matplotlib
 
-if TYPE_CHECKING:
-    from pcil.demos import Demonstrations
-
 KINDS = (".png", ".pdf", ".svg")
 MOST_ENTRIES = 24
 """Only the first entries of observations and of actions are drawn."""
 
 
-def draw(demos: Demonstrations, path: Path) -> Path:
+def draw(demos: Any, path: Path) -> Path:
     """Draw the return (or the length, where there are no rewards) of each episode, and below it every entry of observations and
     actions over the steps, one line for each episode; return the path.
 
-    `InputError` if the name of the file ends in nothing of `KINDS`.
+    `demos` are `pcil.Demonstrations`. `InputError` if the name of the file ends in nothing of `KINDS`.
     """
     if path.suffix not in KINDS:
         raise InputError(f"The picture can't be written to {path}; give a name that ends in {', '.join(KINDS)}.")

@@ -12,7 +12,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-from pcil.demos import shipped
+from pcil.demos.inspect import shipped
 from pcil.report import figures, tables
 from pcil.report.load import Collection, EvalRow, TransitionRow, read_rows
 

@@ -587,7 +587,7 @@ def test_demos_is_a_table_for_people(capsys: pytest.CaptureFixture[str], monkeyp
         "steps": 9,
     }
     shown = row | {"expert": "me [/bold] [red]", "frames": None, "seeds_tried": None, "hash": "0123456789abcdef"}
-    monkeypatch.setattr("pcil.demos.shipped", lambda: [shown])
+    monkeypatch.setattr("pcil.demos.inspect.shipped", lambda: [shown])
     assert cli.main(["demos"]) == 0
     out = capsys.readouterr().out
     assert "me [/bold] [red]" in out and re.search(r"41\.3 \+- 0\.5 +40\.7 +42\.2 ", out) and "01234567 " in out

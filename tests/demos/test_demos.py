@@ -26,7 +26,7 @@ from minari.dataset.minari_storage import MinariStorage
 
 from odd import Odd
 from pcil import demos, envs, seeds
-from pcil.demos import Demonstrations
+from pcil.demos import Demonstrations, inspect
 from pcil.errors import InputError
 from pcil.types import Episode, Spec
 
@@ -465,7 +465,7 @@ def test_a_home_directory_that_cannot_be_determined_is_no_error_of_its_own(monke
 
 
 def test_the_table_of_what_ships_is_read_from_the_data(library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (row,) = demos.shipped()
+    (row,) = inspect.shipped()
     original = make_demos(5, 3)
     assert row == {
         "task": "walker_walk",
@@ -484,7 +484,7 @@ def test_the_table_of_what_ships_is_read_from_the_data(library: Path, monkeypatc
     }
     assert json.loads(json.dumps(row)) == row
     monkeypatch.setattr(demos, "SHIPPED", library / "nothing")
-    assert demos.shipped() == []
+    assert inspect.shipped() == []
     assert "none ship" in refusal(lambda: Demonstrations.load("walker_walk"))
 
 
@@ -492,7 +492,7 @@ def test_a_line_of_the_table_says_what_its_row_says() -> None:
     row = {"task": "walker_walk", "observation_dim": 24, "action_dim": 6, "episodes": 10, "steps": 5000}
     row |= {"return_mean": 961.04, "return_std": 12.35, "return_min": 940.0, "return_max": 975.96}
     row |= {"seeds_tried": 3, "hash": "0123456789abcdef", "expert": "DrQ-v2"}
-    heading, line, untold = demos.table([row, row | {"seeds_tried": None}])
+    heading, line, untold = inspect.table([row, row | {"seeds_tried": None}])
     told = ["walker_walk", "24", "6", "10", "5000", "961.0", "+-", "12.3", "940.0", "976.0", "3", "01234567", "DrQ-v2"]
     assert line.split() == told and untold.split() == [word for word in told if word != "3"]
     assert heading.split() == ["task", "obs", "act", "episodes", "steps", "return", "min", "max", "tries", "hash", "expert"]

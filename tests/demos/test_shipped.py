@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pcil import demos, envs
+from pcil.demos import inspect
 from pcil.policy import load_policy
 
 TASKS = demos.shipped_tasks()
@@ -69,7 +70,7 @@ def test_no_shipped_episode_is_a_failed_one(task: str) -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_table_says_where_it_comes_from(task: str) -> None:
-    row = next(row for row in demos.shipped() if row["task"] == task)
+    row = next(row for row in inspect.shipped() if row["task"] == task)
     info = demos.Demonstrations.load(task).info
     assert row["frames"] >= 100_000 and row["seeds_tried"] >= 1 and len(row["hash"]) == 64
     about = load_policy(POLICIES / task).info

@@ -12,7 +12,8 @@ from pcil.errors import InputError
 COMMANDS = {
     "train": "Train a policy, or resume where a run stopped.",
     "evaluate": "Roll out the policy of a run, without exploration.",
-    "demos": "List the demonstrations that ship.",
+    "demos": "List the demonstrations that ship, or say what a dataset holds.",
+    "import": "Make a dataset of demonstrations from other files.",
     "record": "Record demonstrations from a trained policy.",
     "film": "Film a trained policy.",
     "play": "Show a trained policy in a window.",

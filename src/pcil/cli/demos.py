@@ -33,8 +33,8 @@ def demos(
         trust: Modules that the run's files may name and whose code is then run, such as my.module.
         json_output: Print one JSON list, or one JSON object of a dataset, and nothing else.
     """
-    from pcil.demos import Demonstrations, shipped, table
-    from pcil.demos.inspect import lines, summary
+    from pcil.demos import Demonstrations
+    from pcil.demos.inspect import lines, shipped, summary, table
 
     if path is None:
         if env or score or plot:

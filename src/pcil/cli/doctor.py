@@ -76,7 +76,7 @@ def _environment() -> str:
 
 
 def _demonstrations() -> str:
-    from pcil.demos import shipped
+    from pcil.demos.inspect import shipped
 
     rows = shipped()
     if not rows:

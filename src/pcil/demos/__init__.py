@@ -151,6 +151,25 @@ class Demonstrations:
             raise InputError(f"{n} demonstrations of {self.task} were asked for, but 1 to {available} can be had.")
         return dataclasses.replace(self, episodes=self.episodes[:n])
 
+    def at_least(self, minimum_return: float | int) -> Demonstrations:
+        """The episodes of this return or a higher one; `InputError` if there are none."""
+        return self._picked(np.flatnonzero(self.returns >= minimum_return), f"a return of at least {minimum_return:g}")
+
+    def best(self, n: int) -> Demonstrations:
+        """The `n` episodes of the highest returns, in their order here; `InputError` if there are fewer, or if `n` < 1."""
+        self.take(n)
+        return self._picked(np.sort(np.argsort(-self.returns, kind="stable")[:n]), "a high return")
+
+    def choose(self, n: int, seed: int) -> Demonstrations:
+        """A random choice of `n` episodes, in their order here; `InputError` if there are fewer, or if `n` < 1."""
+        self.take(n)
+        return self._picked(np.sort(np.random.default_rng(seed).permutation(len(self.episodes))[:n]), "luck")
+
+    def _picked(self, indices: np.ndarray, what: str) -> Demonstrations:
+        if not len(indices):
+            raise InputError(f"No episode of the demonstrations of {self.task} has {what}.")
+        return dataclasses.replace(self, episodes=tuple(self.episodes[i] for i in indices))
+
     def save(self, path: str | Path, *, dataset_id: str | None = None) -> Path:
         """Write a Minari dataset folder at `path`, completely or not at all, and return its absolute path.
 
@@ -249,32 +268,6 @@ def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:
 def shipped_tasks() -> list[str]:
     """The names of the tasks whose demonstrations ship with the package."""
     return sorted(path.parents[2].name for path in SHIPPED.glob("dmc/*/expert-v0/data/metadata.json"))
-
-
-def shipped() -> list[dict[str, Any]]:
-    """One row per shipped dataset. All values are computed from the data, except those that only `info` has (else None)."""
-    rows = []
-    for demos in map(Demonstrations.load, shipped_tasks()):
-        dims = {"observation_dim": demos.obs.shape[1], "action_dim": demos.action.shape[1]}
-        counts = {"episodes": len(demos.episodes), "steps": demos.num_steps}
-        returns = {"return_mean": demos.return_mean, "return_std": demos.return_std}
-        returns |= {"return_min": float(demos.returns.min()), "return_max": float(demos.returns.max())}
-        known = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
-        rows.append({"task": demos.task, **dims, **counts, **returns, **known, "hash": demos.hash})
-    return rows
-
-
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """The rows of `shipped` as a plain-text table, one line per dataset."""
-    sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
-    lines = [f"{'task':<18}{sizes}{'return':>15}{'min':>7}{'max':>7}{'tries':>6}  {'hash':<10}expert"]
-    for row in rows:
-        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}{row['steps']:>7}"
-        returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
-        returns = f"{returns:>15}{row['return_min']:>7.1f}{row['return_max']:>7.1f}"
-        tries = "" if row["seeds_tried"] is None else row["seeds_tried"]
-        lines.append(f"{row['task']:<18}{sizes}{returns}{tries:>6}  {row['hash'][:8]:<10}{row['expert']}")
-    return lines
 
 
 def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, bounded: bool = True) -> None:

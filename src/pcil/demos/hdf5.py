@@ -43,6 +43,8 @@ MEMORY = 2**34
 """The address space of the child process in bytes."""
 PATIENCE_SECONDS, BYTES_A_SECOND = 12.0, 5e6
 """The time limit for reading a file: a constant, plus its size divided by a rate."""
+DEPTH, MEMBERS = 6, 100_000
+"""How deep groups are searched for arrays, and how many members each may have."""
 FILTERS = {h5z.FILTER_DEFLATE, h5z.FILTER_LZF, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
 """The allowed filters; the library would search the machine for plugins that implement other ones."""
 
@@ -58,8 +60,9 @@ class Damage(ValueError):
         self.episode = episode
 
 
-def read(path: Path, wanted: dict[str, Any]) -> list[tuple[int | None, Parts]]:
-    """`episodes`, computed in a child process; `Damage` also if that crashes or exceeds its time limit."""
+def read(path: Path, wanted: dict[str, Any] | None) -> list[tuple[int | None, Parts]]:
+    """`episodes`, or `tables` if nothing is `wanted`, computed in a child process; `Damage` also if that crashes or exceeds its
+    time limit."""
     seconds = PATIENCE_SECONDS + (path.stat().st_size if path.exists() else 0) / BYTES_A_SECOND
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-P", __file__, str(path)]
@@ -89,7 +92,8 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard), hard))
     out = sys.stdout.buffer
     try:
-        for seed, parts in episodes(Path(sys.argv[1]), json.load(sys.stdin)):
+        path, wanted = Path(sys.argv[1]), json.load(sys.stdin)
+        for seed, parts in tables(path) if wanted is None else episodes(path, wanted):
             about = {"seed": seed, "parts": {key: len(arrays) for key, arrays in parts.items()}}
             out.write(json.dumps(about).encode() + b"\n")
             for array in (array for arrays in parts.values() for array in arrays):
@@ -125,6 +129,36 @@ def episodes(path: Path, wanted: dict[str, Any]) -> Iterator[tuple[int | None, P
                 yield integer(groups[index], "seed"), numbers
     except Exception as error:  # damaged files make h5py raise many kinds of exceptions
         raise Damage(str(error) or type(error).__name__, index) from error
+
+
+def tables(path: Path) -> Iterator[tuple[None, Parts]]:
+    """All arrays of numbers with one or two axes, by their paths; `Damage` if the file is invalid. Others, such as images and
+    texts, are None."""
+    try:
+        with opened(path) as file:
+            found: dict[str, h5py.Dataset | None] = dict(_plain(file, "", DEPTH))
+            check_size((array for array in found.values() if array is not None), path)
+            yield None, {name: [] if array is None else [array[()]] for name, array in found.items()}
+    except Exception as error:  # damaged files make h5py raise many kinds of exceptions
+        raise Damage(str(error) or type(error).__name__, None) from error
+
+
+def _plain(group: h5py.Group, place: str, depth: int) -> Iterator[tuple[str, h5py.Dataset | None]]:
+    """The arrays below a group by their paths, None for those that are no rows of numbers, without links to other places."""
+    if len(group) > MEMBERS:
+        raise ValueError(f"{place or 'the file'} has {len(group):,} members, and at most {MEMBERS:,} are read")
+    for name in map(str, group):
+        if group.id.links.get_info(name.encode()).type != h5l.TYPE_HARD:
+            continue
+        found = member(group, name)
+        if isinstance(found, h5py.Group):
+            if not depth:
+                raise ValueError(f"{place}{name} lies too deep in groups")
+            yield from _plain(found, f"{place}{name}/", depth - 1)
+        elif isinstance(found, h5py.Dataset):
+            shape = found.shape or ()
+            numbers = found.dtype.kind in "fiub" and len(shape) in (1, 2)
+            yield f"{place}{name}", array(group, name, list(shape[1:])) if numbers else None
 
 
 def _located(group: h5py.Group, boxes: dict[str, Any]) -> Parts:

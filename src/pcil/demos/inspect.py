@@ -1,4 +1,4 @@
-"""What a dataset of demonstrations holds: sizes, returns, ranges, and what looks wrong."""
+"""What `pcil demos` shows: the demonstrations that ship; sizes, returns and ranges of a dataset, and what looks wrong."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pcil.demos import Demonstrations
+from pcil.demos import Demonstrations, shipped_tasks
 
 HUGE = 1e6
 """An absolute value from which on float32 resolves less than a tenth."""
@@ -14,6 +14,32 @@ OFFSET = 1e3
 """How many times its standard deviation an entry may be away from 0 before float32 costs it digits."""
 FEWEST = 4
 """The smallest number of episodes of which one may be called an outlier."""
+
+
+def shipped() -> list[dict[str, Any]]:
+    """One row per shipped dataset. All values are computed from the data, except those that only `info` has (else None)."""
+    rows = []
+    for demos in map(Demonstrations.load, shipped_tasks()):
+        dims = {"observation_dim": demos.obs.shape[1], "action_dim": demos.action.shape[1]}
+        counts = {"episodes": len(demos.episodes), "steps": demos.num_steps}
+        returns = {"return_mean": demos.return_mean, "return_std": demos.return_std}
+        returns |= {"return_min": float(demos.returns.min()), "return_max": float(demos.returns.max())}
+        known = {key: demos.info.get(key) for key in ("expert", "frames", "seeds_tried")}
+        rows.append({"task": demos.task, **dims, **counts, **returns, **known, "hash": demos.hash})
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """The rows of `shipped` as a plain-text table, one line per dataset."""
+    sizes = f"{'obs':>4}{'act':>4}{'episodes':>9}{'steps':>7}"
+    lines = [f"{'task':<18}{sizes}{'return':>15}{'min':>7}{'max':>7}{'tries':>6}  {'hash':<10}expert"]
+    for row in rows:
+        sizes = f"{row['observation_dim']:>4}{row['action_dim']:>4}{row['episodes']:>9}{row['steps']:>7}"
+        returns = f"{row['return_mean']:.1f} +- {row['return_std']:.1f}"
+        returns = f"{returns:>15}{row['return_min']:>7.1f}{row['return_max']:>7.1f}"
+        tries = "" if row["seeds_tried"] is None else row["seeds_tried"]
+        lines.append(f"{row['task']:<18}{sizes}{returns}{tries:>6}  {row['hash'][:8]:<10}{row['expert']}")
+    return lines
 
 
 def summary(demos: Demonstrations) -> dict[str, Any]:

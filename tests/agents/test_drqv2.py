@@ -208,9 +208,9 @@ def test_cloning_takes_a_step_towards_the_demonstrated_actions_of_the_actor_alon
     assert all(same)
 
 
-@pytest.mark.parametrize("every", [1, 2, 32])
+@pytest.mark.parametrize("every", [1, 2, 32, 64])
 def test_the_absorbing_state_has_no_action_to_clone(every: int) -> None:
-    """If all windows but the last begin in it, the last one alone decides."""
+    """If all windows but the last begin in it, the last one alone decides; if all do, there is no error."""
     agent = dataclasses.replace(ABSORBING, cloning=True)
     state, window = agent.init(SPEC, key=jax.random.key(0)), make_window()
     ends = jnp.arange(1, 33) % every != 0

@@ -165,7 +165,7 @@ OTHERS = [
     ("report run/tensorboard --out new", "There is no run in run/tensorboard; give folders that pcil train made"),
     ("report run/run.json --out new", r"left out: run/run\.json is not a file of results"),
     ("report run --out run/run.json/new", "can't be written"),
-    ("demos walker_walk", "Unrecognized options: walker_walk"),
+    ("demos walker_walk cheetah_run", "Unrecognized options: cheetah_run"),
     ("bench --preset best", "'best'"),
     ("bench --seconds nan", "--seconds is nan"),
     ("report run --out run", "run holds something other than a report"),

@@ -189,8 +189,9 @@ def test_a_file_that_is_not_there_is_said(capsys: pytest.CaptureFixture[str]) ->
 def test_a_folder_with_other_settings_is_refused_even_if_it_is_done(demos: str) -> None:
     (job, _) = plan(text := f"{PRODUCT}[settings]\ndemos = '{demos}'\n{NARROW}").jobs
     finish(job.run, job.folder)
-    with pytest.raises(InputError, match=r"pcil/1: .*another run: frames was 300, now 400"):
-        plan(text.replace("frames = 300", "frames = 400"))
+    with pytest.raises(InputError, match=r"pcil/1: .*another run: frames was 300, now 250"):
+        plan(text.replace("frames = 300", "frames = 250"))
+    assert [job.state for job in plan(text.replace("frames = 300", "frames = 400")).jobs] == ["waiting"] * 2
 
 
 # --- Without a file ---

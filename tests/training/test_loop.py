@@ -446,7 +446,7 @@ def test_a_run_whose_checkpoint_has_only_the_lengths_of_its_logs_goes_on(demos: 
     ("change", "said"),
     [
         ({"seed": 2}, "seed was 1, now 2"),
-        ({"frames": 400}, "frames was 300, now 400"),
+        ({"frames": 250}, "frames was 300, now 250"),
         ({"agent": "gamma"}, "agent.gamma was 0.99, now 0.9"),
         ({"num_demos": 2}, "num_demos was None, now 2"),
     ],

@@ -105,7 +105,7 @@ def words(out: Path, *more: str) -> list[str]:
 def test_several_loggers_are_told_and_none_of_their_names_is_taken_for_the_task(tmp_path: Path) -> None:
     assert cli.main(words(tmp_path / "run", "--callbacks", "own_agent:Log", "own_agent:Second")) == 0
     own: Any = sys.modules["own_agent"]
-    assert own.Log.lines == own.Second.lines == [0, 300]
+    assert own.Log.lines == own.Second.lines == [0, 500]
     assert json.loads((tmp_path / "run" / "run.json").read_text())["run"]["task"] == POINT_MASS
 
 

@@ -208,6 +208,11 @@ def test_cloning_takes_a_step_towards_the_demonstrated_actions_of_the_actor_alon
     assert all(same)
 
 
+@pytest.mark.parametrize("cloning", [False, True, None])
+def test_whether_it_clones_is_its_setting(cloning: bool | None) -> None:
+    assert dataclasses.replace(AGENT, cloning=cloning).clones is cloning
+
+
 @pytest.mark.parametrize("every", [1, 2, 32, 64])
 def test_the_absorbing_state_has_no_action_to_clone(every: int) -> None:
     """If all windows but the last begin in it, the last one alone decides; if all do, there is no error."""

@@ -69,11 +69,11 @@ def adam(network: Any, slope: Any, first: Any, second: Any, count: Any) -> tuple
 
 @jax.jit
 def naive(
-    nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, count: Any, cloned: Window | None = None
+    nets: dict[str, Any], w: Window, target_noise: Any, actor_noise: Any, count: Any, weight: Any, cloned: Window | None = None
 ) -> tuple[dict[str, Any], Any]:
     """Update number `count`: target, critic step, actor step on the new critic, slow critic. Returns networks and losses.
 
-    With `cloned` windows, the actor's loss is `-mean Q / (mean |target| + 0.001) + 10 mean |mu(s) - a|^2`.
+    With `cloned` windows, the actor's loss is `-mean Q / (mean |target| + 0.001) + weight mean |mu(s) - a|^2`.
     """
     nets = dict(nets)
     s0, s2, a0 = w.obs[:, 0], w.obs[:, 2], w.action[:, 0]
@@ -99,7 +99,7 @@ def naive(
     if cloned is not None:
         losses["cloning_error"], other = jax.value_and_grad(cloning_error)(nets["actor"])
         size = jnp.mean(jnp.abs(target)) + 1e-3
-        slope = jax.tree.map(lambda g, c: g / size + 10 * c, slope, other)
+        slope = jax.tree.map(lambda g, c: g / size + weight * c, slope, other)
     nets["actor"], *nets["actor opt_state"] = adam(nets["actor"], slope, *nets["actor opt_state"], count)
     nets["slow"] = jax.tree.map(lambda slow, fast: 0.8 * slow + 0.2 * fast, nets["slow"], nets["critic"])
     return nets, losses
@@ -112,11 +112,12 @@ def close(got: Any, expected: Any, name: str) -> None:
 
 @pytest.mark.parametrize("cloning", [False, True])
 def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
-    """At three steps of the noise schedule. Adam's state shows the size of each gradient, which its first step does not."""
-    agent = dataclasses.replace(AGENT, cloning=cloning)
+    """At three steps of the schedules of the noise and of cloning's weight. Adam's state shows the
+    size of each gradient, which its first step does not."""
+    agent = dataclasses.replace(AGENT, cloning=cloning, cloning_weight=LinearSchedule(10.0, 2.0, 1000))
     state = agent.init(SPEC, key=jax.random.key(0))
     more = {"cloned": window(9)} if cloning else {}
-    steps, keys = (0, 500, 5000), [jax.random.key(10 + i) for i in range(3)]
+    steps, weights, keys = (0, 500, 5000), (10.0, 6.0, 2.0), [jax.random.key(10 + i) for i in range(3)]
     draws = [jax.random.normal(key, (2, 32, 2)) for key in keys]
     update = jax.jit(lambda s, w, step, key: agent.update(s, w, **more, step=step, key=key))
     got: list[tuple[DrQV2State, Any]] = []
@@ -131,7 +132,7 @@ def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
         for i, (after, metrics) in enumerate(got):
             noise = np.clip(DEVIATION[steps[i]] * np.asarray(draws[i], np.float64), -0.3, 0.3)
             nets, losses = naive(
-                nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1), *map(double, more.values())
+                nets, double(window(i)), *map(jnp.asarray, noise), jnp.float64(i + 1), weights[i], *map(double, more.values())
             )
             for name, value in losses.items():
                 assert float(metrics[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), (i, name)

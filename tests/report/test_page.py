@@ -105,6 +105,8 @@ def test_it_says_what_was_found(report: Path) -> None:
     words = Page(report.read_text()).words
     assert "13 runs: " in words and "A run is left out & said so." in words
     assert "<b>my.module:Mine</b>" in words, "a name is shown literally"
+    first = [words.index(f"\n{title}\n") for title in ("Returns at a glance", "Learning curves", "Final return of each task")]
+    assert first == sorted(first), "the answer comes first"
     for title in ("Final return of each task", "Comparison with the paper", "Sample efficiency", "Health of the learned"):
         assert title in words
     assert "200.0 [-48.4,\u00a0448.4]" in words and "agent.gamma: 0.99" in words and "commit: 0123456789abcdef" in words

@@ -116,3 +116,14 @@ def test_slow_features_are_a_copy_which_outlives_what_it_was_made_of() -> None:
     for leaf in jax.tree.leaves(first):
         leaf.delete()
     assert np.array_equal(slow.embed.weight, EMBED.weight)
+
+
+def test_every_so_manyth_step_of_each_demonstration_is_used() -> None:
+    def demo(steps: int) -> Batch:
+        t = jnp.arange(steps, dtype=jnp.float32)[:, None]
+        return Batch(t, -t, t + 0.5)
+
+    kept = Sum(subsampling=5).subsampled([demo(12), demo(11), demo(2), demo(2)])
+    assert [part.obs[:, 0].tolist() for part in kept] == [[0, 5, 10], [1, 6], [1], [1]]
+    assert all(np.array_equal(part.action, -part.obs) and np.array_equal(part.next_obs, part.obs + 0.5) for part in kept)
+    assert [len(part.obs) for part in Sum().subsampled([demo(12), demo(3)])] == [12, 3]

@@ -540,10 +540,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_command_prints_a_table_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_table_and_draws_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["theory"]) == 0
     out = capsys.readouterr().out
-    assert "TV = 0.25, D_cont = 0.0000" in out and out.endswith("\nFigure: theory.png\n")
+    assert "TV = 0.25, D_cont = 0.0000" in out and "Figure" not in out and not list(tmp_path.iterdir())
+    assert cli.main(["theory", "--out", "."]) == 0
+    assert capsys.readouterr().out == f"{out}Figure: theory.png\n"
     assert {path.name for path in tmp_path.iterdir()} == {"theory.png", "theory.pdf"}
     assert cli.main(["theory", "--out", "deep/er", "--json", "--seed", "3"]) == 0
     out, err = capsys.readouterr()
@@ -558,7 +560,7 @@ def test_without_matplotlib_it_says_what_to_install(
     monkeypatch.delitem(sys.modules, "pcil.theory.figure", raising=False)
     monkeypatch.delitem(sys.modules, "pcil.report.figures", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert cli.main(["theory"]) == 0
+    assert cli.main(["theory", "--out", "."]) == 0
     told = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
     assert capsys.readouterr().out.splitlines()[-1] == told
     assert not list(tmp_path.iterdir())

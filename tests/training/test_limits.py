@@ -22,7 +22,7 @@ LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
     DrQV2(): {
         **dict.fromkeys(["batch_size", "n_step", "feature_dim", "hidden"], (1, inf)),
         **dict.fromkeys(["gamma", "learning_rate", "tau", "noise_correlation", "averaging_rate"], (0, 1)),
-        **dict.fromkeys(["noise_clip", "cloning_weight"], (0, inf)),
+        "noise_clip": (0, inf),
     },
     BC(): {"learning_rate": (0, 1), "deviation": (1e-6, inf), "feature_dim": (1, inf), "hidden": (1, inf)},
     PCIL(): {

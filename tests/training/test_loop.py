@@ -21,6 +21,7 @@ import pytest
 from pcil import envs
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, RunError
+from pcil.nets.noise import LinearSchedule
 from pcil.policy import load_policy
 from pcil.training import checkpoint, collect, learner, loop, presets, runs
 from pcil.training.callbacks import Callback, History
@@ -129,7 +130,9 @@ def test_a_clone_acts_from_the_first_update_on(demos: str, tmp_path: Path) -> No
     """A clone of the optimal policy reaches most of its return as soon as updates begin; an untrained actor does not."""
     shares = []
     for cloning in (False, True):
-        agent = dataclasses.replace(small_run().agent, cloning=cloning, cloning_weight=1000.0, learning_rate=1e-3)
+        agent = dataclasses.replace(
+            small_run().agent, cloning=cloning, cloning_weight=LinearSchedule(1000.0, 1000.0), learning_rate=1e-3
+        )
         run = small_run(demos=demos, agent=agent, cloning_updates=1000, seed_frames=100, frames=101, evaluate_every=1000)
         finish(run, tmp_path / str(cloning))
         last = [float(row[2]) for row in rows(tmp_path / str(cloning))[0][1:] if row[0] != "0"]

@@ -17,8 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcil.report.load import read_evaluations
-from pcil.training.callbacks import EVAL_COLUMNS, Callback, Callbacks, LogFiles, TensorBoard
+from pcil.training.callbacks import EVAL_COLUMNS, Callback, Callbacks, LogFiles
 from pcil.training.evaluate import Evaluation
+from pcil.training.loggers import TensorBoard
 from pcil.training.metrics import pearson
 from pcil.training.state import WALL_CLOCK
 from small import small_run

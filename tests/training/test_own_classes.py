@@ -14,8 +14,9 @@ import pytest
 import pcil
 from pcil import cli, modules
 from pcil.errors import InputError, RunError
-from pcil.training.callbacks import Callback, Callbacks, History, TensorBoard
+from pcil.training.callbacks import Callback, Callbacks, History
 from pcil.training.config import Run, run_of_file
+from pcil.training.loggers import TensorBoard
 from small import POINT_MASS, save_point_mass_demos, small_run
 
 NETS = """

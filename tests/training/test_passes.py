@@ -231,6 +231,18 @@ def test_an_offline_agent_has_passes_of_500_updates_on_draws_of_the_demonstratio
             assert np.array_equal(expert.obs, ended.expert.sample(rng, 3, 1).obs)
 
 
+def test_the_reward_is_given_every_so_manyth_step_of_the_demonstrations(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[Any] = []
+    real = learner.update
+    monkeypatch.setattr(learner, "update", lambda *given: seen.append(given[3]) or real(*given))
+    run = recorded(frames=300, reward=dataclasses.replace(recorded().reward, subsampling=7))
+    loop.train_loop(run, tmp_path, DEMOS)
+    expected = {tuple(obs) for i, demo in enumerate(DEMOS) for obs in demo.obs[i % 7 : -1 : 7].tolist()}
+    assert {tuple(obs) for window in seen for obs in window.obs[:, 0].tolist()} == expected
+
+
 def test_without_demonstrations_no_rows_of_them_are_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Whatever number of rows the reward asks for."""
     experts: list[Any] = []

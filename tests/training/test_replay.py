@@ -5,6 +5,7 @@ Each row identifies itself: the observation at time t of episode e is `1000 e + 
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 
 import hypothesis.stateful as stateful
@@ -190,6 +191,22 @@ def test_every_valid_start_is_drawn_and_all_equally_often(n: int) -> None:
     drawn = Counter(check(replay.sample(np.random.default_rng(5), 20_000, n), expected, 20_000, n))
     assert len(naive.episodes) < 7
     assert set(drawn) == set(expected)
+    assert chisquare(list(drawn.values())).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("every", [2, 3, 7])
+@pytest.mark.parametrize("n", [1, 3])
+def test_windows_may_start_at_every_so_manyth_step_only(n: int, every: int) -> None:
+    """Each of these starts equally often; the first one is step i modulo `every` of the i-th episode, or its last start."""
+    episodes = [make_episode(name, steps, name % 2 == 0) for name, steps in enumerate((9, 4, 5, 12))]
+    replay = Replay.of([dataclasses.replace(episode, reward=stored_reward(episode)) for episode in episodes])
+    expected = set()
+    for name, episode in enumerate(episodes):
+        starts = [t for t in range(len(episode)) if episode.terminated or t + n <= len(episode)]
+        expected |= {1000.0 * name + t for t in starts[min(name % every, len(starts) - 1) :: every]}
+    rng = np.random.default_rng(0)
+    drawn = Counter(replay.sample(rng, 200 * len(expected), n, every).obs[:, 0, 0].tolist())
+    assert set(drawn) == expected
     assert chisquare(list(drawn.values())).pvalue > 1e-3
 
 

@@ -63,8 +63,9 @@ class DrQV2(Agent):
     cloning: bool | None = False
     """Train the actor by behavioural cloning as well, before the first update and in every update. None: if the demonstrations
     have actions. The statistics of observations are then those of the demonstrations and the agent together."""
-    cloning_weight: float = 10.0
-    """Weight of the squared error of the cloned actions, relative to values of mean absolute value 1, if `cloning`."""
+    cloning_weight: LinearSchedule = field(default_factory=lambda: LinearSchedule(10.0, 10.0, 30_000))
+    """Schedule of the weight of the squared error of the cloned actions, over agent steps, relative to values of mean absolute
+    value 1, if `cloning`."""
     averaging_rate: float = 1.0
     """Rate, per update, at which an average of the actor's parameters follows the actor. The average is evaluated and saved,
     and the actor itself explores and learns. 1: there is no average."""
@@ -74,8 +75,7 @@ class DrQV2(Agent):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_ranges(self, gamma=(0, 1), learning_rate=(0, 1), tau=(0, 1), noise_clip=(0, inf), noise_correlation=(0, 1))
-        check_ranges(self, feature_dim=(1, inf), hidden=(1, inf), cloning_weight=(0, inf))
-        check_ranges(self, averaging_rate=(0, 1))
+        check_ranges(self, feature_dim=(1, inf), hidden=(1, inf), averaging_rate=(0, 1))
 
     @property
     def clones(self) -> bool | None:
@@ -159,7 +159,7 @@ class DrQV2(Agent):
                 return loss, {"actor_loss": loss}
             error = self.cloning_error(state, actor, cloned)
             size = jnp.mean(jnp.abs(target)) + 1e-3
-            return loss / size + self.cloning_weight * error, {"actor_loss": loss, "cloning_error": error}
+            return loss / size + self.cloning_weight(step) * error, {"actor_loss": loss, "cloning_error": error}
 
         gradient, more = jax.grad(loss_of, has_aux=True)(state.actor)
         actor, actor_opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)

@@ -75,7 +75,7 @@ def train(argv: list[str], execute: Execute) -> int:
     def train(
         out: Path,
         run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default,
-        callbacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODULE:CLASS ...")] = (),
+        callbacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
     ) -> int:
         """Train a policy, or resume where a run stopped.
 
@@ -84,7 +84,7 @@ def train(argv: list[str], execute: Execute) -> int:
 
         Args:
             out: The run's folder; one that holds the same run resumes it.
-            callbacks: Loggers of your own, such as my.module:MyLogger.
+            callbacks: Further loggers: wandb, mlflow, or your own, such as my.module:MyLogger.
         """
         modules.admit("The task", modules.of_task(task), None)
         modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), None)
@@ -100,7 +100,7 @@ def _train_again(argv: list[str], execute: Execute) -> int:
         Args:
             settings: The run.json of a run, or its content as one argument in JSON.
             out: The run's folder; one that holds the same run resumes it.
-            callbacks: Loggers of your own, such as my.module:MyLogger, which are told how the run goes.
+            callbacks: Further loggers: wandb, mlflow, or your own, such as my.module:MyLogger.
             trust: Modules that the settings may name, whose code is then run, such as my.module.
         """
         return execute(_run_of(settings, trust), out, _callbacks(callbacks))
@@ -127,9 +127,11 @@ def _callbacks(specs: Sequence[str]) -> "list[Callback]":
     """Create an object of each named class."""
     from pcil import modules
     from pcil.training.callbacks import Callback
+    from pcil.training.loggers import LOGGERS
 
-    modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec)], None)
-    classes = [modules.load("--callbacks", spec, Callback, "my.module:MyLogger") for spec in specs]
+    modules.admit("--callbacks", [name for spec in specs for name in modules.of_class(spec, LOGGERS)], None)
+    expected = f"{', '.join(LOGGERS)} or my.module:MyLogger"
+    classes = [LOGGERS.get(spec) or modules.load("--callbacks", spec, Callback, expected) for spec in specs]
     return [modules.instance("--callbacks", kind) for kind in classes]
 
 

@@ -128,6 +128,8 @@ CHECKS: tuple[Check, ...] = (
     ("Ray clusters", _importable("ray", "ray"), "pip install '.[sweep]' in a clone", False),
     ("ONNX", _importable("onnxruntime", "onnxruntime"), "pip install '.[onnx]' in a clone", False),
     ("MP4 films", _importable("imageio_ffmpeg", "imageio-ffmpeg"), "pip install '.[film]' in a clone", False),
+    ("Weights & Biases", _importable("wandb", "wandb"), "pip install '.[wandb]' in a clone", False),
+    ("MLflow", _importable("mlflow", "mlflow-skinny"), "pip install '.[mlflow]' in a clone", False),
     ("rendering", _rendering, "apt install libegl1 (or libosmesa6) and set MUJOCO_GL=egl (or osmesa)", False),
 )
 

@@ -10,10 +10,10 @@ from pcil.errors import shown
 
 
 def theory(out: Path | None = None, seed: int = 0, json_output: Json = False) -> int:
-    """Check the paper's Theorem 1 numerically, and draw it.
+    """Check the paper's Theorem 1 numerically, and draw it where --out names a folder.
 
     Args:
-        out: The folder for theory.png and theory.pdf; by default the current one, or no figure with --json.
+        out: The folder for theory.png and theory.pdf; without it there is no figure.
         seed: The seed of the random pairs.
         json_output: Print one JSON object and nothing else.
     """
@@ -23,16 +23,16 @@ def theory(out: Path | None = None, seed: int = 0, json_output: Json = False) ->
     pairs = [theory.random_pairs(atoms, seed=seed) for atoms in theory.ATOMS]
     figures = theory.measure(pairs)
     drawn = ""
-    if out is not None or not json_output:
+    if out is not None:
         try:
             from pcil.theory.figure import draw
         except ImportError:
             drawn = "No figure is drawn without matplotlib; pip install '.[report]' in a clone brings it."
         else:
-            drawn = shown(f"Figure: {draw(pairs, out or Path())}")
-    print(json.dumps(figures) if json_output else f"{theory.table(figures)}\n\n{drawn}")
-    if json_output and drawn:
-        print(drawn, file=sys.stderr)
+            drawn = shown(f"Figure: {draw(pairs, out)}")
+    print(json.dumps(figures) if json_output else theory.table(figures))
+    if drawn:
+        print(drawn, file=sys.stderr if json_output else sys.stdout)
     return 0
 
 

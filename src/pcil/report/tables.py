@@ -211,14 +211,20 @@ def markdown(table: Table) -> str:
 
 
 def write(name: str, table: Table, folder: Path) -> None:
-    """Write `<name>.md` with title and caption, and `<name>.csv`, in which an interval has three columns."""
+    """Write `<name>.md` with title and caption, and `<name>.csv`: an interval has three columns, an unknown number is empty."""
     title, caption = title_and_caption(MAKERS[name])
     (folder / f"{name}.md").write_text(f"# {title}\n\n{caption}\n\n{markdown(table)}", encoding="utf-8")
     first = zip(table.header, table.rows[0], strict=True)
     header = [[word, f"{word} low", f"{word} high"] if isinstance(value, Interval) else [word] for word, value in first]
     split = ([value if isinstance(value, Interval) else (value,) for value in row] for row in table.rows)
-    lines = ([round(value, 6) if isinstance(value, float) else value for value in itertools.chain(*row)] for row in split)
+    lines = ([_rounded(value) for value in itertools.chain(*row)] for row in split)
     write_csv(folder / f"{name}.csv", [itertools.chain(*header), *lines])
+
+
+def _rounded(value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    return None if math.isnan(value) else round(value, 6)
 
 
 def _final(runs: Sequence[Sequence[EvalRow]]) -> tuple[int, np.ndarray]:

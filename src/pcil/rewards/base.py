@@ -71,10 +71,12 @@ class Reward(abc.ABC):
     """Weight of the environment's own reward, which is added to the learned one."""
     batch_size: int = 128
     """Number of expert steps in an update, and of agent steps."""
+    subsampling: int = 1
+    """Use every N-th step of each demonstration only, beginning with step i modulo N in the i-th one, as GAIL and PWIL did."""
 
     def __post_init__(self) -> None:
         check_kinds(self)
-        check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf))
+        check_ranges(self, task_weight=(-inf, inf), batch_size=(0, inf), subsampling=(1, inf))
 
     @property
     def needs_actions(self) -> bool:
@@ -100,6 +102,11 @@ class Reward(abc.ABC):
     def prefill(self) -> tuple[int, float]:
         """The number of expert steps that the replay starts with, and the reward stored for each of them."""
         return 0, 0.0
+
+    def subsampled(self, demos: Sequence[Batch]) -> list[Batch]:
+        """Every `subsampling`-th step of each demonstration, and at least one."""
+        every = self.subsampling
+        return [Batch(*(array[min(i % every, len(array) - 1) :: every] for array in demo[:3])) for i, demo in enumerate(demos)]
 
     @abc.abstractmethod
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> Any:

@@ -60,7 +60,7 @@ class PCIL(Reward):
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
         sizes: Any = {"hidden": self.hidden, "batch_size": self.batch_size, "head": self.head}
-        return init_embedding(demos, embed, self.inputs, **sizes, key=key)
+        return init_embedding(self.subsampled(demos), embed, self.inputs, **sizes, key=key)
 
     def loss(
         self,

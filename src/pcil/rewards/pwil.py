@@ -85,8 +85,6 @@ class PWIL(Reward):
     """The reward of a step that costs nothing."""
     beta: float = 5.0
     """How fast the reward falls: `sigma = beta horizon / sqrt(dimensions)`."""
-    subsampling: int = 1
-    """Use every N-th step of each demonstration, starting at a random offset."""
     refresh: int = 5000
     """Updates between two copies of the actor's trunk; the first copy is the untrained trunk."""
     prefill_steps: int = 0
@@ -94,7 +92,7 @@ class PWIL(Reward):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(self, alpha=(1e-6, inf), beta=(0, inf), subsampling=(1, inf), refresh=(1, inf), prefill_steps=(0, inf))
+        check_ranges(self, alpha=(1e-6, inf), beta=(0, inf), refresh=(1, inf), prefill_steps=(0, inf))
 
     @property
     def trunk(self) -> Literal["critic", "actor"]:
@@ -109,13 +107,8 @@ class PWIL(Reward):
         return select("state" if self.inputs == "trunk" else self.inputs, batch, lambda obs: obs)
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> PWILState:
-        offsets = jax.random.randint(key, (len(demos),), 0, self.subsampling)
-        chosen = []
-        for demo, offset in zip(demos, offsets, strict=True):
-            steps = len(demo.obs)
-            rows = offset + self.subsampling * jnp.arange(max(steps // self.subsampling, 1))
-            chosen.append(self.points(demo)[jnp.minimum(rows, steps - 1)])
-        atoms = jnp.concatenate(chosen)
+        del key
+        atoms = jnp.concatenate([self.points(demo) for demo in self.subsampled(demos)])
         scale = Scaler.init(atoms.shape[1]).update(atoms).normalizer
         slow = SlowFeatures.init(embed) if self.inputs == "trunk" else None
         horizon = jnp.int32(max(len(demo.obs) for demo in demos))

@@ -150,7 +150,7 @@ class SIL(SinkhornReward):
         width = jax.eval_shape(lambda demo: select(self.inputs, demo, embed), demos[0]).shape[-1]
         critic = MLP.init((width, self.hidden, self.hidden, self.embedding), key=key)
         adversary = Adversary(critic, adam_init(critic), jnp.zeros(()), jnp.int32(0))
-        return SinkhornState(Demos.of(demos), jnp.zeros(()), adversary)
+        return SinkhornState(Demos.of(self.subsampled(demos)), jnp.zeros(()), adversary)
 
     def loss(
         self,
@@ -206,7 +206,7 @@ class POTIL(SinkhornReward):
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> SinkhornState:
         del key
-        return SinkhornState(Demos.of(demos), jnp.zeros(()), SlowFeatures.init(embed))
+        return SinkhornState(Demos.of(self.subsampled(demos)), jnp.zeros(()), SlowFeatures.init(embed))
 
     def update(
         self, state: SinkhornState, expert: Batch, agent: Batch, embed: Embed, *, key: PRNGKeyArray

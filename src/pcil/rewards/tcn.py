@@ -56,7 +56,7 @@ class TCN(Reward):
 
     def init(self, demos: Sequence[Batch], embed: Embed, *, key: PRNGKeyArray) -> EmbeddingState:
         sizes: Any = {"hidden": self.hidden, "batch_size": self.batch_size, "head": self.head}
-        return init_embedding(demos, embed, "state", **sizes, key=key)
+        return init_embedding(self.subsampled(demos), embed, "state", **sizes, key=key)
 
     def loss(
         self,

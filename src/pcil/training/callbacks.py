@@ -1,16 +1,13 @@
-"""Callbacks that are told how a run goes: its log files, TensorBoard, and loggers of a user's own."""
+"""Callbacks that are told how a run goes: the log files, and what loggers of a user's own subclass."""
 
 from __future__ import annotations
 
 import contextlib
 import csv
 import io
-import itertools
 import json
 import math
 import os
-import statistics
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -169,60 +166,6 @@ class LogFiles(Callback):
     def _write(self, name: str, text: str) -> None:
         _write(self._files[name], text)
         self._written[name].append(text)
-
-
-class TensorBoard(Callback):
-    """Writes TensorBoard's file of a run; a resumed run rebuilds it from the logs.
-
-    It is written in this thread, so that a full disk raises here and not in another thread.
-    """
-
-    def begin(self, run: Run, folder: Path, history: History) -> None:
-        from tensorboardX.record_writer import RecordWriter
-
-        place = folder / "tensorboard"
-        place.mkdir(exist_ok=True)
-        for path in place.glob("events.out.tfevents.*"):
-            path.unlink()
-        self._began = time.time() - history.seconds
-        self._writer = RecordWriter(str(place / f"events.out.tfevents.{int(self._began)}.pcil"))
-        self._event(0.0, file_version="brain.Event:2")
-        for row in history.episodes:
-            self.episode(row)
-        for frames, group in itertools.groupby(history.evaluations, key=lambda row: row["frames"]):
-            episodes = list(group)
-            columns = {name: [float(row[name]) for row in episodes if name in row] for name in ("return", "success")}
-            self._means(columns, int(frames), float(episodes[0]["seconds"]))
-        self._writer.flush()
-
-    def episode(self, row: dict[str, Any]) -> None:
-        for name, value in row.items():
-            if isinstance(value, float) and math.isfinite(value):
-                self._scalar(name if "/" in name else f"episode/{name}", value, row["frames"], row.get("seconds", 0.0))
-
-    def evaluation(self, frames: int, seconds: float, result: Evaluation) -> None:
-        columns = {"return": result.returns.tolist(), "success": result.success or []}
-        self._means(columns, frames, float(f"{seconds:.1f}"))  # as the logs have it
-        self._writer.flush()
-
-    def end(self) -> None:
-        self._writer.close()
-
-    def _means(self, columns: dict[str, list[float]], frames: int, seconds: float) -> None:
-        """The mean of each column of an evaluation that has values."""
-        for name, values in columns.items():
-            if values:
-                self._scalar(f"evaluation/{name}", statistics.fmean(values), frames, seconds)
-
-    def _scalar(self, name: str, value: float, frames: int, seconds: float) -> None:
-        from tensorboardX.summary import scalar
-
-        self._event(seconds, step=frames, summary=scalar(name, value))
-
-    def _event(self, seconds: float, **content: Any) -> None:
-        from tensorboardX.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue] - protobuf makes it
-
-        self._writer.write(Event(wall_time=self._began + seconds, **content).SerializeToString())
 
 
 def _rewound(path: Path, log: str | None, tell: Callback) -> io.FileIO:

@@ -118,7 +118,7 @@ def _update(run: Run, state: State, replay: Replay, counters: Counters, rng: np.
         _clone(run, state, replay)
     rows, span = run.reward.batch_size, run.reward.span
     window = replay.sample(rng, run.agent.batch_size, run.agent.n_step)
-    expert = state.expert.sample(rng, rows, span) if state.expert and rows else None
+    expert = state.expert.sample(rng, rows, span, run.reward.subsampling) if state.expert and rows else None
     longer = replay.sample(rng, rows, span) if span > run.agent.n_step else None
     cloned = state.expert.sample(rng, run.agent.batch_size, 1) if state.expert and run.agent.clones else None
     step, count = np.int32(counters.steps), np.int32(counters.updates)

@@ -10,10 +10,11 @@ from typing import Any
 from pcil import envs
 from pcil.training import state as states
 from pcil.training import warm
-from pcil.training.callbacks import Callback, Callbacks, LogFiles, TensorBoard
+from pcil.training.callbacks import Callback, Callbacks, LogFiles
 from pcil.training.collect import labelled, play, store, study
 from pcil.training.config import Run
 from pcil.training.evaluate import environments_for, evaluate
+from pcil.training.loggers import TensorBoard
 from pcil.types import Episode
 
 

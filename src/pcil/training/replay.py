@@ -41,7 +41,7 @@ class Replay:
         self._segments: deque[Segment] = deque()
         self._next = 0
         self._added = 0
-        self._index: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._index: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @classmethod
     def of(cls, episodes: Sequence[Episode]) -> Replay:
@@ -85,20 +85,22 @@ class Replay:
         self._next = (self._next + rows) % self.capacity
         self._index = {}
 
-    def sample(self, rng: np.random.Generator, batch: int, n: int) -> Window:
+    def sample(self, rng: np.random.Generator, batch: int, n: int, every: int = 1) -> Window:
         """`batch` windows of `n` steps, uniform over all valid starts, with replacement.
 
+        Windows start at every `every`-th step only, beginning with step i modulo `every` of the i-th episode that was added, or
+        with the last one that a shorter episode has.
         A window never reaches past a time limit. One that reaches past a termination has discount 0 from that step on, its
         actions and rewards behind it are 0, and its observations repeat the final one.
         """
-        table, cumulative = self._starts(n)
-        total = self.num_windows(n)
+        table, cumulative = self._starts(n, every)
+        total = int(cumulative[-1]) if len(cumulative) else 0
         if total == 0:
             raise InputError(f"The replay holds no window of {n} steps: every episode in it is shorter.")
         draw = rng.integers(total, size=batch)
         which = np.searchsorted(cumulative, draw, side="right")
-        start, length, terminated, episode_id, before = table[which].T
-        offset = (draw - before)[:, None] + np.arange(n + 1)
+        start, length, terminated, episode_id, first, before = table[which].T
+        offset = (first + every * (draw - before))[:, None] + np.arange(n + 1)
         row = (start[:, None] + np.minimum(offset, length[:, None])) % self.capacity
         inside = offset[:, :-1] < length[:, None]
         alive = inside & ~((offset[:, :-1] == length[:, None] - 1) & (terminated[:, None] == 1))
@@ -136,11 +138,14 @@ class Replay:
     def _free(self) -> int:
         return self.capacity - sum(segment.length + 1 for segment in self._segments)
 
-    def _starts(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """A row `(start, length, terminated, episode_id, valid starts before)` an episode, and the total of valid starts."""
-        if n not in self._index:
-            counts = np.array([segment.starts(n) for segment in self._segments], np.int64)
-            cumulative = np.cumsum(counts)
+    def _starts(self, n: int, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """A row `(start, length, terminated, episode_id, first start, valid starts before)` an episode, and the running total
+        of valid starts."""
+        if (n, every) not in self._index:
+            steps = np.array([segment.starts(n) for segment in self._segments], np.int64)
             table = np.array(self._segments, np.int64).reshape(-1, 4)
-            self._index[n] = np.column_stack([table, cumulative - counts]), cumulative
-        return self._index[n]
+            first = np.clip(table[:, 3] % every, 0, np.maximum(steps - 1, 0))
+            counts = (steps - first + every - 1) // every
+            cumulative = np.cumsum(counts)
+            self._index[n, every] = np.column_stack([table, first, cumulative - counts]), cumulative
+        return self._index[n, every]

@@ -287,7 +287,7 @@ def test_train_help_shows_the_settings_of_the_method(
     method: str, shown: list[str], hidden: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["train", "hopper_hop", "--method", method, "--preset", "paper", "--help"]) == 0
-    out = capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
     assert "(default: hopper_hop)" in out and f"(default: {method})" in out and "2000000" in out
     assert all(option in out for option in shown) and not any(option in out for option in hidden)
 

@@ -110,6 +110,40 @@ def test_a_gymnasium_env_is_flattened_and_rescaled(register_env: Any) -> None:
         assert env.unwrapped.last_action.dtype == np.float64
 
 
+@pytest.mark.parametrize(
+    ("box", "received"),
+    [
+        (spaces.Box(-np.inf, np.inf, (2,), np.float64), [[-2.0, -2.0], [3.0, 3.0]]),
+        (spaces.Box(np.array([-np.inf, 0.0]), np.array([0.5, np.inf]), dtype=np.float64), [[-2.0, 0.0], [0.5, 3.0]]),
+    ],
+)
+def test_actions_without_bounds_are_given_some(box: spaces.Box, received: list[list[float]], register_env: Any) -> None:
+    """Those that have a bound keep it."""
+    register_env("Open-v0", DictEnv, action_space=box)
+    env = make("pcil_test/Open-v0", env_kwargs={"action-bounds": [-2, 3.0]})
+    env.reset(seed=0)
+    for sign, expected in zip((-1.0, 1.0), received, strict=True):
+        env.step(np.full(2, sign, np.float32))
+        np.testing.assert_allclose(env.unwrapped.last_action, expected, atol=1e-15)
+    assert envs.origin(env)[3:5] == tuple(received)
+    given = make(DictEnv(action_space=box), env_kwargs={"action-bounds": [-2, 3.0]})
+    assert envs.origin(given)[3:5] == tuple(received)
+
+
+@pytest.mark.parametrize("bounds", [[1, 1], [2, 1], [1], "wide", [0, float("inf")], [None, 1], 3])
+def test_bounds_are_two_numbers(bounds: Any) -> None:
+    env = DictEnv(action_space=spaces.Box(-np.inf, np.inf, (2,)))
+    with pytest.raises(InputError, match="must be two numbers, the lower one first"):
+        make(env, env_kwargs={"action-bounds": bounds})
+
+
+def test_bounds_that_do_not_fit_the_actions_are_refused() -> None:
+    with pytest.raises(InputError, match="already; leave out --action-bounds"):
+        make("Pendulum-v1", env_kwargs={"action-bounds": [-1, 1]})
+    with pytest.raises(InputError, match="don't fit the actions"):
+        make(DictEnv(action_space=spaces.Box(5.0, np.inf, (2,))), env_kwargs={"action-bounds": [-1, 1]})
+
+
 def test_a_real_gymnasium_env_works() -> None:
     env = make("Pendulum-v1")
     assert spec(env) == Spec(3, 1, 1)
@@ -139,7 +173,7 @@ def test_an_episode_without_an_end_is_refused(register_env: Any, monkeypatch: py
     [
         ({"action_space": spaces.Discrete(2)}, r"actions of 'pcil_test/Bad-v0' must be a flat Box.*Discrete\(2\)"),
         ({"action_space": spaces.Box(-1.0, 1.0, (2, 2))}, "must be a flat Box"),
-        ({"action_space": spaces.Box(-np.inf, np.inf, (2,))}, "must have finite bounds"),
+        ({"action_space": spaces.Box(-np.inf, np.inf, (2,))}, "must have finite bounds.*--action-bounds LOW HIGH"),
         ({"observation_space": spaces.Discrete(2)}, "observations of 'pcil_test/Bad-v0' must be a Box or a Dict"),
         ({"observation_space": spaces.Dict({"a": spaces.Discrete(2)})}, "must be a Box or a Dict of Boxes"),
     ],

@@ -20,7 +20,7 @@ from safetensors.numpy import load_file
 from test_demos import edit_metadata, forget_checksum, refusal
 
 import pcil.training.fit
-from pcil import demos, envs
+from pcil import cli, demos, envs
 from pcil.demos import Demonstrations
 from pcil.errors import InputError, json_object
 from pcil.policy import load_policy
@@ -41,7 +41,7 @@ class Slider(gymnasium.Env):
         self.bound, self.skip, self.what, self.render_mode = bound, skip, what, render_mode
         self.dt = 0.1 * skip
         self.observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
-        self.action_space = spaces.Box(-bound, bound, (2,), np.float32)
+        self.action_space = spaces.Box(*((-np.inf, np.inf) if what == "unbounded" else (-bound, bound)), (2,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         super().reset(seed=seed, options=options)
@@ -58,6 +58,7 @@ class Slider(gymnasium.Env):
 def sliders() -> Iterator[None]:
     """Register the plain environment, and two with arguments in their registration."""
     ids = {"test/slider-v0": {}, "test/wide-v0": {"bound": 10.0}, "test/other-v0": {"what": "other"}}
+    ids |= {"test/open-v0": {"what": "unbounded"}}
     for name, kwargs in ids.items():
         gymnasium.register(name, "test_fit:Slider", kwargs=kwargs, max_episode_steps=8)
     yield
@@ -101,6 +102,21 @@ def test_another_action_box_is_refused_until_it_is_said_which_holds(
         assert said[1] == "Clipped 48 of 48 entries of the demonstrations' actions, by at most 6."
     else:
         np.testing.assert_allclose(fit(folder, task, demos_mismatch="keep")[0].action, kept, rtol=1e-6)
+
+
+def test_actions_without_bounds_are_given_some_on_the_command_line(tmp_path: Path) -> None:
+    """The run, its policy and the demonstrations know the bounds; the demonstrations of other bounds are refused."""
+    folder = save(tmp_path, "test/open-v0", by_us=True, **{"action-bounds": [-3.0, 3.0]})
+    small = "--frames 40 --seed-frames 16 --random-frames 16 --evaluate-episodes 1 --agent.hidden 16 --agent.batch-size 8"
+    words = ["train", "test/open-v0", "--method", "dac", "--demos", folder, "--reward.hidden", "16", "--reward.batch-size", "8"]
+    words += [*small.split(), "--action-bounds", "-3", "3", "--out"]
+    assert cli.main([*words, str(tmp_path / "run")]) == 0
+    policy = load_policy(tmp_path / "run")
+    assert policy.env_kwargs == {"action-bounds": [-3.0, 3.0]}
+    assert policy.action_bounds is not None and [bound.tolist() for bound in policy.action_bounds] == [[-3, -3], [3, 3]]
+    assert cli.main(["evaluate", str(tmp_path / "run"), "--episodes", "1"]) == 0
+    words[words.index("-3")] = "-2"
+    assert cli.main([*words, str(tmp_path / "other")]) == 2
 
 
 @settings(max_examples=30, deadline=None)

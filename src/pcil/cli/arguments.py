@@ -22,7 +22,7 @@ Execute = Callable[..., int]
 """`(run, folder, callbacks) -> exit code`. The types are not spelled out, because `tyro` would have to resolve them here."""
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 """The option of commands that can print one JSON object or list and nothing else."""
-SEVERAL = ("callbacks",)
+SEVERAL = ("callbacks", "action-bounds")
 """The options of `pcil train` that take several values."""
 
 
@@ -76,6 +76,7 @@ def train(argv: list[str], execute: Execute) -> int:
         out: Path,
         run: Annotated[Run, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = default,
         callbacks: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+        action_bounds: tuple[float, float] | None = None,
     ) -> int:
         """Train a policy, or resume where a run stopped.
 
@@ -85,10 +86,13 @@ def train(argv: list[str], execute: Execute) -> int:
         Args:
             out: The run's folder; one that holds the same run resumes it.
             callbacks: Further loggers: wandb, mlflow, or your own, such as my.module:MyLogger.
+            action_bounds: Bounds of the actions, for an environment whose actions have none. They become the argument
+                "action-bounds" of the environment.
         """
         modules.admit("The task", modules.of_task(task), None)
         modules.admit("--env-kwargs", modules.of_task("", run.env_kwargs), None)
-        return execute(dataclasses.replace(run, task=task), out, _callbacks(callbacks))
+        env_kwargs = run.env_kwargs | ({envs.BOUNDS: list(action_bounds)} if action_bounds else {})
+        return execute(dataclasses.replace(run, task=task, env_kwargs=env_kwargs), out, _callbacks(callbacks))
 
     return call("train", train, argv)
 

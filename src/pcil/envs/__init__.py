@@ -36,6 +36,9 @@ TASKS = (
 LONGEST_EPISODE = 100_000
 """The number of steps after which an episode without a time limit is considered endless."""
 
+BOUNDS = "action-bounds"
+"""The name, among the arguments of an environment, of bounds `[low, high]` for actions that have none. It is no keyword."""
+
 _GIVEN = ("object ", "function ")
 """The prefixes of the names of environments that were passed from Python, as an object or as a function."""
 
@@ -92,17 +95,20 @@ def make(task: Any, render_mode: str | None = None, *, env_kwargs: dict[str, Any
 
     `task` is a task of the DeepMind Control suite ("walker_walk" or "dmc/walker_walk-v0"), a toy ("toy/point_mass-v0"), any
     Gymnasium id, a function that creates an environment, or an environment. `env_kwargs` are passed to `gymnasium.make` or to
-    the function. The environment's observations may be Boxes, or Dicts and Tuples of Boxes. They are flattened, actions are
-    rescaled, and all return values are checked (`pcil.envs.checked:Checked`).
+    the function, except `action-bounds`, the bounds `[low, high]` of actions that have none. The environment's observations may
+    be Boxes, or Dicts and Tuples of Boxes. They are flattened, actions are rescaled, and all return values are checked
+    (`pcil.envs.checked:Checked`).
     """
-    env = task if isinstance(task, gymnasium.Env) else _made(task, render_mode, env_kwargs)
+    arguments = dict(env_kwargs or {})
+    bounds = arguments.pop(BOUNDS, None)
+    env = task if isinstance(task, gymnasium.Env) else _made(task, render_mode, arguments)
     if isinstance(env, Checked):
         return env
     registered = env.spec
     own = registered is not None and registered.namespace in SUITES
     limited = own or (registered is not None and registered.max_episode_steps is not None)
     try:
-        return Checked(_flat_actions(env, task_name(task)), task_name(task), None if limited else LONGEST_EPISODE)
+        return Checked(_flat_actions(env, task_name(task), bounds), task_name(task), None if limited else LONGEST_EPISODE)
     except Exception as error:
         if env is not task:
             env.close()
@@ -240,12 +246,17 @@ def _refuse_name(task: str, error: Exception) -> NoReturn:
     ) from error
 
 
-def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
+def _flat_actions(env: gymnasium.Env, task: str, bounds: Any) -> gymnasium.Env:
     space = env.action_space
     if not isinstance(space, spaces.Box) or space.shape in ((), (0,)) or len(space.shape) > 1 or space.dtype.kind != "f":
         raise InputError(f"The actions of {task!r} must be a flat Box of real numbers; they are {space}.")
+    if bounds is not None:
+        env = _bounded(env, space, bounds, task)
+        space = env.action_space
     if not space.is_bounded():
-        raise InputError(f"The actions of {task!r} must have finite bounds; they are {space}.")
+        raise InputError(
+            f"The actions of {task!r} must have finite bounds; they are {space}, and --action-bounds LOW HIGH gives them some."
+        )
     dtype = space.dtype
     if np.any(space.low != -1.0) or np.any(space.high != 1.0):
         one = np.ones(space.shape, dtype)
@@ -254,6 +265,22 @@ def _flat_actions(env: gymnasium.Env, task: str) -> gymnasium.Env:
         box = spaces.Box(-1.0, 1.0, space.shape, np.float32)
         env = wrappers.TransformAction(env, lambda action: np.asarray(action, dtype), box)
     return env
+
+
+def _bounded(env: gymnasium.Env, space: spaces.Box, bounds: Any, task: str) -> gymnasium.Env:
+    """The environment with actions between `bounds` where they have none."""
+    match bounds:
+        case [int() | float() as low, int() | float() as high] if -np.inf < low < high < np.inf:
+            pass
+        case _:
+            raise InputError(f"The bounds of the actions are {brief(bounds)}; they must be two numbers, the lower one first.")
+    if space.is_bounded():
+        raise InputError(f"The actions of {task!r} are in {space} already; leave out --action-bounds.")
+    low = np.where(np.isfinite(space.low), space.low, space.dtype.type(low))
+    high = np.where(np.isfinite(space.high), space.high, space.dtype.type(high))
+    if np.any(low >= high):
+        raise InputError(f"The bounds {bounds} don't fit the actions of {task!r}, which are {space}.")
+    return wrappers.TransformAction(env, lambda action: action, spaces.Box(low, high, dtype=space.dtype.type))
 
 
 register()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import subprocess
@@ -18,7 +19,9 @@ import pytest
 from PIL import Image
 
 from fake_runs import fake_run
-from pcil import cli
+from pcil import cli, demos
+from pcil.demos import Demonstrations
+from pcil.envs import make
 from pcil.nets.networks import Actor
 from pcil.policy import Policy
 from pcil.report import film
@@ -302,3 +305,62 @@ def test_a_task_of_deepmind_control_is_filmed_or_the_sentence_says_what_is_missi
     else:
         assert done.returncode == 2 and "MUJOCO_GL" in done.stderr and done.stderr.startswith("pcil: "), done.stderr
         assert not (tmp_path / "film.mp4").exists()
+
+
+# --- pcil demos --film ---
+
+
+class Runner(Clock):
+    """Its observation is the sum of the actions and `drift`, beginning with a random number."""
+
+    drift = 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.place = self.np_random.uniform(-0.1, 0.1, 3).astype(np.float32)
+        return self.place.copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        _, reward, terminated, truncated, info = super().step(action)
+        self.place = (self.place + 0.05 * action.sum() + (self.drift if self.time > 3 else 0)).astype(np.float32)
+        return self.place.copy(), reward, terminated, truncated, info
+
+
+@pytest.fixture
+def runs_recorded(tmp_path: Path) -> Iterator[str]:
+    """Two recorded episodes of random actions."""
+    gymnasium.register("test/runner-v0", Runner, disable_env_checker=True)
+    rng = np.random.default_rng(0)
+    act = lambda obs: rng.uniform(-1, 1, 2).astype(np.float32)  # noqa: E731
+    demos.record(act, make("test/runner-v0"), 2, task="test/runner-v0", seed=5, info={}).save(tmp_path / "demos")
+    yield "test/runner-v0"
+    del gymnasium.registry["test/runner-v0"]
+
+
+def test_recorded_episodes_are_filmed_again(runs_recorded: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The recorded actions lead from the recorded seeds through the recorded states, picture by picture."""
+    assert cli.main(["demos", "demos", "--film", "film.gif", "--film-episodes", "2"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "Film: film.gif, 10 pictures of 2 of 2 episodes"
+    assert shades_of(Path("film.gif"))[0] == pytest.approx([0, 40, 80, 120, 160] * 2, abs=2)
+
+
+def test_an_episode_ends_where_the_environment_leaves_the_recorded_states(
+    runs_recorded: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(Runner, "drift", 0.5)
+    assert cli.main(["demos", "demos", "--film", "film.gif"]) == 0
+    said = capsys.readouterr().out.splitlines()[-2:]
+    assert said[0] == f"Episode 0 is filmed until step 4 of 10, where {runs_recorded} leaves the recorded states."
+    assert shades_of(Path("film.gif"))[0] == pytest.approx([0, 40], abs=2)
+
+
+def test_what_can_not_be_filmed_again_is_said(runs_recorded: str, capsys: pytest.CaptureFixture[str]) -> None:
+    held = Demonstrations.load("demos")
+    Demonstrations.from_arrays(obs=[e.obs for e in held.episodes]).save("states")
+    unseeded = tuple(dataclasses.replace(episode, seed=None) for episode in held.episodes)
+    dataclasses.replace(held, episodes=unseeded).save("unseeded")
+    film_of = lambda name: ["demos", name, "--env", runs_recorded, "--film", "film.gif"]  # noqa: E731
+    assert "no actions" in refused(film_of("states"), capsys)
+    assert "Episode 0 has no seed" in refused(film_of("unseeded"), capsys)
+    assert "ends in .gif or .mp4" in refused(["demos", "demos", "--film", "film.avi"], capsys)
+    assert "--film are about one dataset" in refused(["demos", "--film", "film.gif"], capsys)

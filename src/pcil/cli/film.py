@@ -1,10 +1,6 @@
 """`pcil film`."""
 
-import contextlib
-import os
-import sys
 from pathlib import Path
-from typing import Any
 
 from pcil.cli import arguments
 from pcil.errors import InputError, shown
@@ -40,39 +36,27 @@ def film(
         env_kwargs: Keyword arguments of the environment, in JSON; by default those of the training.
         trust: Modules that the policy's files may name and whose code is then run, such as my.module.
     """
-    from pcil import envs
-    from pcil.envs import dmc
+    from pcil import seeds
     from pcil.report import film
+    from pcil.seeds import Stream
     from pcil.training.evaluate import playable
 
     arguments.within(1, 100, episodes=episodes)
     arguments.within(0, 2**31 - 1, seed=seed)
-    fps = (10.0 if out.suffix == ".gif" else 25.0) if fps is None else fps
-    if not 0.1 <= fps <= 1000:
+    if fps is not None and not 0.1 <= fps <= 1000:
         raise InputError(f"--fps is {fps:g}; it must be from 0.1 to 1000.")
     for side in size or ():
         arguments.within(16, 4096, size=side)
     film.check_name(out)
     policy, played = playable(folder, env_kwargs, trust)
-    ours = envs.gymnasium_id(policy.task).startswith("dmc/")
-    played = played | (_looks(size, camera) if ours else _looks(None, camera))
-    if not ours and not os.environ.get("MUJOCO_GL") and dmc.renderer() == "egl":
-        os.environ["MUJOCO_GL"] = "egl"  # Gymnasium's own environments of MuJoCo would look for a display
-    drawn: dict[str, Any] = {"render_mode": "rgb_array", "env_kwargs": played}
-    with contextlib.redirect_stdout(sys.stderr), envs.opened(policy.task, **drawn) as env:  # environments may print
+    starts, returns = [seeds.episode_seed(seed, Stream.EVALUATE, i) for i in range(episodes)], []
+    with film.opened(policy.task, played, size, camera) as env:
         policy.check_fits(env)
-        count, returns = film.write(policy, env, out, episodes=episodes, seed=seed, fps=fps, size=size)
+        images = lambda every: film.pictures(policy, env, policy.task, starts, every, returns)  # noqa: E731
+        count = film.write(images, env, out, fps=fps, size=size)
     paid = "  ".join(f"{value:.1f}" for value in returns)
     print(f"{shown(policy.task)}: {shown(str(out))}, {count} pictures, return {paid}")
     return 0
-
-
-def _looks(size: tuple[int, int] | None, camera: str | None) -> dict[str, Any]:
-    """The keyword arguments of an environment for the size and for the camera."""
-    options: dict[str, Any] = {"width": size[0], "height": size[1]} if size else {}
-    if camera is not None:
-        options["camera_id"] = int(camera) if camera.isdecimal() else camera
-    return options
 
 
 def main(argv: list[str]) -> int:

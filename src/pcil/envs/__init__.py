@@ -251,8 +251,7 @@ def _flat_actions(env: gymnasium.Env, task: str, bounds: Any) -> gymnasium.Env:
     if not isinstance(space, spaces.Box) or space.shape in ((), (0,)) or len(space.shape) > 1 or space.dtype.kind != "f":
         raise InputError(f"The actions of {task!r} must be a flat Box of real numbers; they are {space}.")
     if bounds is not None:
-        env = _bounded(env, space, bounds, task)
-        space = env.action_space
+        env, space = _bounded(env, space, bounds, task)
     if not space.is_bounded():
         raise InputError(
             f"The actions of {task!r} must have finite bounds; they are {space}, and --action-bounds LOW HIGH gives them some."
@@ -267,8 +266,8 @@ def _flat_actions(env: gymnasium.Env, task: str, bounds: Any) -> gymnasium.Env:
     return env
 
 
-def _bounded(env: gymnasium.Env, space: spaces.Box, bounds: Any, task: str) -> gymnasium.Env:
-    """The environment with actions between `bounds` where they have none."""
+def _bounded(env: gymnasium.Env, space: spaces.Box, bounds: Any, task: str) -> tuple[gymnasium.Env, spaces.Box]:
+    """The environment with actions between `bounds` where they have none, and its box of actions."""
     match bounds:
         case [int() | float() as low, int() | float() as high] if -np.inf < low < high < np.inf:
             pass
@@ -280,7 +279,8 @@ def _bounded(env: gymnasium.Env, space: spaces.Box, bounds: Any, task: str) -> g
     high = np.where(np.isfinite(space.high), space.high, space.dtype.type(high))
     if np.any(low >= high):
         raise InputError(f"The bounds {bounds} don't fit the actions of {task!r}, which are {space}.")
-    return wrappers.TransformAction(env, lambda action: action, spaces.Box(low, high, dtype=space.dtype.type))
+    box = spaces.Box(low, high, dtype=space.dtype.type)
+    return wrappers.TransformAction(env, lambda action: action, box), box
 
 
 register()

@@ -1,4 +1,4 @@
-"""Animations of policies, if the machine can render: short ones for reports, and those of `pcil film`."""
+"""Animations of policies and demonstrations, if the machine can render: short ones for reports, and those of the commands."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ import io
 import itertools
 import os
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pcil import envs, seeds
+from pcil.envs import dmc
 from pcil.envs.rollout import Rollout
 from pcil.errors import InputError, brief
-from pcil.policy import Policy
 from pcil.report.load import Collection, Track, named, quietly
 from pcil.seeds import Stream
 from pcil.training.evaluate import playable
+from pcil.types import Episode
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -53,22 +55,44 @@ def film(folder: Path, trust: Sequence[str] = (), steps: int = 160, every: int =
         policy.check_fits(env)
         start = seeds.episode_seed(policy.info.get("seed", 0), Stream.EVALUATE, 0)
         file = io.BytesIO()
-        _save(itertools.islice(pictures(policy, env, [start], every), -(-steps // every)), file, "WEBP", every / _rate(env))
+        shown = pictures(policy, env, policy.task, [start], every)
+        _save(itertools.islice(shown, -(-steps // every)), file, "WEBP", every / _rate(env))
     return file.getvalue()
 
 
-def write(
-    policy: Policy, env: envs.Checked, out: Path, *, episodes: int, seed: int, fps: float, size: tuple[int, int] | None = None
-) -> tuple[int, list[float]]:
-    """Film the first `episodes` evaluation episodes of `seed` in an environment whose `render_mode` is "rgb_array".
+@contextlib.contextmanager
+def opened(
+    task: str, env_kwargs: dict[str, Any], size: tuple[int, int] | None = None, camera: str | None = None
+) -> Iterator[envs.Checked]:
+    """The environment of a task with `render_mode` "rgb_array", without a display. A task of DeepMind Control draws pictures of
+    `size` (width, height); `camera` is the argument `camera_id`, a name or a number. What it prints goes to standard error."""
+    looks: dict[str, Any] = {} if camera is None else {"camera_id": int(camera) if camera.isdecimal() else camera}
+    if envs.gymnasium_id(task).startswith("dmc/"):
+        looks |= {"width": size[0], "height": size[1]} if size else {}
+    elif not os.environ.get("MUJOCO_GL") and dmc.renderer() == "egl":
+        os.environ["MUJOCO_GL"] = "egl"  # Gymnasium's own environments of MuJoCo would look for a display
+    with contextlib.redirect_stdout(sys.stderr), envs.opened(task, "rgb_array", env_kwargs=env_kwargs | looks) as env:
+        yield env
 
-    The film shows real time, with about `fps` pictures a second, at most one for each agent step. Pictures that are not of
-    `size` (width, height) are scaled. Returns the number of pictures and the return of each episode. `InputError` if the
-    environment gives no pictures; then there is no file.
+
+def write(
+    images_every: Callable[[int], Iterator[Image]],
+    env: envs.Checked,
+    out: Path,
+    *,
+    fps: float | None = None,
+    size: tuple[int, int] | None = None,
+) -> int:
+    """Write a film of what `images_every(N)` gives, a picture of `env` for every N-th agent step.
+
+    The film shows real time, with about `fps` pictures a second, by default 25, or 10 in a GIF, at most one an agent step.
+    Pictures that are not of `size` (width, height) are scaled. Returns the number of pictures. `InputError` if the environment
+    gives no pictures; then there is no file.
     """
     from PIL.Image import Dither
 
-    every, returns, count = max(1, round(_rate(env) / fps)), [], 0
+    fps = (10.0 if out.suffix == ".gif" else 25.0) if fps is None else fps
+    every, count = max(1, round(_rate(env) / fps)), 0
 
     def counted(images: Iterator[Image]) -> Iterator[Image]:
         nonlocal count
@@ -76,8 +100,7 @@ def write(
             image = image if size in (None, image.size) else image.resize(size)
             yield image.quantize(128, dither=Dither.NONE) if out.suffix == ".gif" else image  # smaller than dithered
 
-    starts = [seeds.episode_seed(seed, Stream.EVALUATE, i) for i in range(episodes)]
-    images = counted(pictures(policy, env, starts, every, returns))
+    images = counted(images_every(every))
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(f".{os.getpid()}.{out.name}")
     try:
@@ -88,7 +111,7 @@ def write(
         partial.replace(out)
     finally:
         partial.unlink(missing_ok=True)
-    return count, returns
+    return count
 
 
 def check_name(out: Path) -> None:
@@ -106,17 +129,45 @@ def check_name(out: Path) -> None:
 
 
 def pictures(
-    policy: Policy, env: envs.Checked, starts: Sequence[int], every: int, returns: list[float] | None = None
+    policy: Callable[[np.ndarray], np.ndarray],
+    env: envs.Checked,
+    task: str,
+    starts: Sequence[int],
+    every: int,
+    returns: list[float] | None = None,
 ) -> Iterator[Image]:
     """A picture before each `every`-th agent step of an episode from each of the seeds; `returns` is given their returns."""
     for number, start in enumerate(starts, start=1):
         rollout = Rollout([env], [start], [f"filmed episode {number}"], keep=False)
         while rollout.playing:
             if rollout.lengths[0] % every == 0:
-                yield _picture(env, policy.task)
+                yield _picture(env, task)
             rollout.step([policy(rollout.obs[0])])
         if returns is not None:
             returns.append(float(rollout.returns[0]))
+
+
+def replayed(episodes: Sequence[Episode], env: envs.Checked, task: str, every: int, told: list[str]) -> Iterator[Image]:
+    """Pictures of recorded episodes, whose actions are repeated from the seeds of their resets.
+
+    Where the environment leaves the recorded states, as it may on another processor or with another version, the episode ends
+    and `told` is given a sentence.
+    """
+    for number, episode in enumerate(episodes):
+        if episode.seed is None:
+            raise InputError(f"Episode {number} has no seed, so its first state can't be made again for a film.")
+        rollout, length = Rollout([env], [episode.seed], [f"filmed episode {number}"], keep=False), len(episode)
+        for step in range(length):
+            if not np.allclose(rollout.obs[0], episode.obs[step], rtol=0.01, atol=0.01):
+                told.append(
+                    f"Episode {number} is filmed until step {step} of {length}, where {task} leaves the recorded states."
+                )
+                break
+            if step % every == 0:
+                yield _picture(env, task)
+            if not rollout.playing:
+                break
+            rollout.step([episode.action[step]])
 
 
 def _picture(env: envs.Checked, task: str) -> Image:

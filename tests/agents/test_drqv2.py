@@ -259,3 +259,13 @@ def test_the_averaged_actor_takes_the_environments_own_observations() -> None:
     averaged, obs = agent.averaged(state), random_batch(5, SPEC.obs_dim - 1, 2).obs
     assert averaged is not None and AGENT.averaged(AGENT.init(SPEC, key=jax.random.key(0))) is None
     assert np.array_equal(averaged(obs, np), agent.actor(state)(obs, np)), "before the first update they are equal"
+
+
+def test_a_warm_start_begins_the_average_too() -> None:
+    """With the earlier actor; without an average there is none afterwards either."""
+    earlier = AGENT.actor(AGENT.init(SPEC, key=jax.random.key(7)))
+    for agent in (AGENT, dataclasses.replace(AGENT, averaging_rate=0.5)):
+        state = agent.started_from(agent.init(SPEC, key=jax.random.key(0)), earlier)
+        assert all(map(np.array_equal, arrays(state.actor), arrays(earlier)))
+        assert (state.averaged is None) == (agent is AGENT)
+    assert all(map(np.array_equal, arrays(state.averaged), arrays(earlier)))

@@ -9,6 +9,7 @@ import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,20 +80,22 @@ class Page(HTMLParser):
 
 
 def test_the_page_needs_nothing_but_itself(report: Path) -> None:
-    """Images are embedded, and links lead into the page or to its tables; no script, no address, and less than 5 MB."""
+    """Images and scripts are embedded, links lead into the page or to its files; no address is opened; less than 5 MB."""
     text = report.read_text()
     seen = Page(text)
-    assert seen.open == [] and "script" not in seen.tags
-    assert len(seen.sources) == 3 + 1 + 1 + 3 + 1, "curves of three tasks and of all, health, t-SNE of three tasks, a film"
-    assert all(source.startswith("data:image/") for source in seen.sources)
+    assert seen.open == [] and seen.tags.count("script") == 3
+    assert len(seen.sources) == 1 + 1 + 3 + 1, "curves for readers without scripts, health, t-SNE of three tasks, a film"
+    assert seen.sources[0] == "figures/curves.png" and (report.parent / seen.sources[0]).is_file()
+    assert all(source.startswith("data:image/") for source in seen.sources[1:])
     for target in seen.targets:
         inside = target == "data:," or (target.startswith("#") and target[1:] in seen.ids)
         assert inside or (report.parent / target).is_file(), target
-    assert not re.search(r"https?:|@import|url\(", text) and len(text) < 5e6
+    text = text.replace("/*! https://github.com/leeoniya/uPlot (v1.6.32) */", "")
+    assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttp|import\(", text) and len(text) < 5e6
 
 
 def test_its_images_are_whole(report: Path) -> None:
-    for source in Page(report.read_text()).sources:
+    for source in Page(report.read_text()).sources[1:]:
         kind, data = re.fullmatch(r"data:image/([\w+]+);base64,(.*)", source).groups()
         image = base64.b64decode(data, validate=True)
         if kind == "webp":
@@ -135,16 +138,53 @@ def test_its_rows_alone_make_the_same_report(report: Path, tmp_path: Path) -> No
     assert "No animation" in again.words and "agent.gamma" not in again.words
 
 
+def charts_can_be_looked_at_closely(window: Any) -> None:
+    """Values under the pointer, a zoom that a double click ends, and a choice of methods and tasks."""
+    chart = window.locator(".chart", has_text="walker_run").first
+    chart.scroll_into_view_if_needed()
+    plot = chart.locator(".u-over")
+    box = plot.bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    window.mouse.move(*middle)
+    legend = chart.locator(".u-legend").inner_text()
+    assert re.search(r"pcil\s*[\d.]+ \[-?[\d.]+, [\d.]+\]", legend), legend
+    ticks = "e => [...document.querySelectorAll('.chart')].map(c => c.querySelector('.uplot').clientWidth)"
+    assert all(width > 100 for width in window.evaluate(ticks))
+
+    scale = "charted.find(each => each.chart.title === 'walker_run').plot.scales.x"
+    whole = window.evaluate(f"[{scale}.min, {scale}.max]")
+    window.mouse.down()
+    window.mouse.move(middle[0] + box["width"] / 4, middle[1], steps=5)
+    window.mouse.up()
+    low, high = window.evaluate(f"[{scale}.min, {scale}.max]")
+    assert whole[0] < low < high < whole[1]
+    window.mouse.dblclick(*middle)
+    assert window.evaluate(f"[{scale}.min, {scale}.max]") == whole
+
+    method, task = window.locator("fieldset.choices").all()
+    shown = "charted.find(each => each.chart.title === 'walker_run').plot.series.filter(s => s.show).length"
+    before = window.evaluate(shown)
+    method.get_by_text("dac").click()
+    assert window.evaluate(shown) == before - 3, "the line and the bounds of its band"
+    method.get_by_text("dac").click()
+    assert window.evaluate(shown) == before
+    task.get_by_text("walker_run").click()
+    assert not chart.is_visible()
+    task.get_by_text("walker_run").click()
+    assert chart.is_visible()
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", [(1280, 900), (390, 844)], ids=["desktop", "phone"])
-def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
+def test_the_page_in_a_browser(size: tuple[int, int], scheme: Any, report: Path) -> None:
     """No error in the console, no request, nothing wider than the window; images load, and a click enlarges or closes one."""
     assert shutil.which(CHROMIUM), "this test needs a browser: apt-get install chromium"
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
-        window = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        window = browser.new_page(viewport={"width": size[0], "height": size[1]}, color_scheme=scheme)
         said: list[str] = []
         asked: list[str] = []
         window.on("console", lambda message: said.append(message.text))
@@ -152,11 +192,11 @@ def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
         window.on("request", lambda request: asked.append(request.url))
         window.goto(report.as_uri())
         if folder := os.environ.get("PCIL_SCREENSHOTS"):
-            window.screenshot(path=Path(folder) / f"page-{size[0]}.png", full_page=True)
+            window.screenshot(path=Path(folder) / f"page-{size[0]}-{scheme}.png", full_page=True)
         assert window.title().startswith("pcil report") and said == []
         assert {url for url in asked if not url.startswith("data:")} == {report.as_uri()}
         images = window.evaluate("[...document.images].map(i => [i.complete, i.naturalWidth, i.getBoundingClientRect().width])")
-        assert len(images) == 9 and all(done and width > 0 and shown > 0 for done, width, shown in images)
+        assert len(images) == 5 and all(done and width > 0 and shown > 0 for done, width, shown in images)
 
         def overflow() -> list[str]:
             """Elements that extend beyond the window, except inside elements with their own scroll bars."""
@@ -172,6 +212,7 @@ def test_the_page_in_a_browser(size: tuple[int, int], report: Path) -> None:
             summary.click()
         assert overflow() == [], "opened settings fit too"
 
+        charts_can_be_looked_at_closely(window)
         picture = window.locator(".zoom img").first
         before = picture.bounding_box()
         picture.click()

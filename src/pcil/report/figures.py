@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import itertools
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,17 +89,14 @@ def assign_styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, st
     return found
 
 
-def learning_curves(found: Collection, folder: Path) -> dict[str, str]:
-    """Learning curves: the mean over seeds with Student's 95% interval as a band, and each seed as a thin line.
-
-    The last figure has interquartile means over each method's own tasks, with a bootstrap interval as a band. A method that
-    takes no step in the environment is a horizontal line. Click a figure to enlarge it, and again to close it.
-    """
+def learning_curves(found: Collection, folder: Path) -> None:
+    """Draw the mean over seeds with Student's 95% interval as a band, and each seed as a thin line: all tasks on one sheet,
+    each on its own, and interquartile means over each method's own tasks with a bootstrap interval."""
     styles = assign_styles(found.rows)
-    grid(found.rows, folder / "curves", styles=styles)  # all tasks on one sheet, as papers print it
-    drawn = {task: grid(rows, folder / f"curves-{file}", styles=styles) for task, file, rows in _by_task(found, found.rows)}
-    together = aggregate(found.rows, folder / "aggregate", styles)
-    return drawn | ({"all tasks": together} if together else {})
+    grid(found.rows, folder / "curves", styles=styles)
+    for _, file, rows in _by_task(found, found.rows):
+        grid(rows, folder / f"curves-{file}", styles=styles)
+    aggregate(found.rows, folder / "aggregate", styles)
 
 
 def reward_health(found: Collection, folder: Path) -> dict[str, str]:
@@ -124,8 +120,8 @@ def t_sne(found: Collection, folder: Path) -> dict[str, str]:
     return {task: scatter_grid(rows, folder / f"representation-{file}", columns=2) for task, file, rows in tasks}
 
 
-FIGURES: list[Callable[[Collection, Path], dict[str, str]]] = [learning_curves, reward_health, t_sne]
-"""What draws each kind of figure of a report into a folder; those of the page are returned as SVG, by title."""
+FIGURES: list[Callable[[Collection, Path], dict[str, str]]] = [reward_health, t_sne]
+"""What draws each kind of figure of a report's page into a folder, and returns its figures as SVG, by title."""
 
 
 def run_curve(folder: Path, expert_return: float | None) -> Path:
@@ -178,7 +174,7 @@ def grid(
             experts = {run[0].expert_return for runs in groups.values() for run in runs} - {None}
             drawn += [_expert_line(axis, expert) for expert in experts if expert is not None]
         ylabel = {"return_mean": "return", "correlation": "correlation with true reward"}[value]
-        _label_axes(axis, f"{escape_label(task)}, {_count('seed', groups)}", ylabel, drawn)
+        _label_axes(axis, f"{escape_label(task)}, {_counted([len(runs) for runs in groups.values()], 'seed')}", ylabel, drawn)
     return save(figure, path)
 
 
@@ -188,29 +184,22 @@ def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str],
     If methods have different numbers of tasks, the legend states the number. If no task has a known expert, nothing is drawn
     and "" is returned.
     """
-    strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
-    for name, runs in by_variant(rows).items():
-        frames, returns = matrix(runs)
-        if (share := stats.share_of_expert(runs, returns)) is not None:
-            strata.setdefault(name[1:], []).append((frames, share))
-    if not strata:
+    found = stats.share_curves(rows)
+    if not found:
         return ""
     figure, (axis,) = _axes(1, 1)
     drawn = [1.0]
-    for name in (name for name in styles if name in strata):
-        tasks = strata[name]
-        frames = functools.reduce(np.intersect1d, [own for own, _ in tasks])
-        scores = [share[:, np.isin(own, frames)] for own, share in tasks]
-        center, text = stats.iqm(*scores), escape_label(label(name, styles))
-        if len({len(tasks) for tasks in strata.values()}) > 1:
-            text += f" ({len(tasks)} task{'s' * (len(tasks) > 1)})"
+    counts = sorted({tasks for _, tasks in found.values()})
+    for name in (name for name in styles if name in found):
+        curve, tasks = found[name]
+        text = escape_label(label(name, styles)) + (f" ({_counted([tasks], 'task')})" if len(counts) > 1 else "")
         if name[0] in OFFLINE:
-            axis.axhline(center[-1], label=text, **styles[name].line)
+            axis.axhline(curve.center[-1], label=text, **styles[name].line)
         else:
-            _band_line(axis, frames, center, stats.bootstrap(stats.iqm, scores), styles[name], text)
-        drawn += center.tolist()
+            _band_line(axis, curve, styles[name], text)
+        drawn += curve.center.tolist()
     _expert_line(axis, 1.0)
-    _label_axes(axis, _count("task", strata), "share of expert (IQM)", drawn)
+    _label_axes(axis, _counted(counts, "task"), "share of expert (IQM)", drawn)
     return save(figure, path)
 
 
@@ -280,19 +269,15 @@ def _seed_lines(axis: Axes, runs: Sequence[Sequence[EvalRow]], value: str, style
         axis.plot(
             [row.frames for row in run], [getattr(row, value) for row in run], color=style.colour, alpha=0.35, linewidth=0.7
         )
-    frames, values = matrix(runs, value)
-    if len(frames):
-        center, *bounds = np.array([stats.mean_interval(column) for column in values.T]).T
-        _band_line(axis, frames, center, bounds, style, name)
+    if len((curve := stats.curve(runs, value)).frames):
+        _band_line(axis, curve, style, name)
 
 
-def _band_line(
-    axis: Axes, frames: np.ndarray, center: np.ndarray, bounds: Sequence[np.ndarray] | np.ndarray, style: Style, label: str
-) -> None:
+def _band_line(axis: Axes, curve: stats.Curve, style: Style, label: str) -> None:
     """Draw a method's line with a few markers, and the band between the bounds if they are known."""
-    if np.isfinite(bounds[0]).all():
-        axis.fill_between(frames, bounds[0], bounds[1], color=style.colour, alpha=0.15, linewidth=0)
-    axis.plot(frames, center, label=label, markevery=max(len(frames) // 6, 1), **style.line)
+    if np.isfinite(curve.low).all():
+        axis.fill_between(curve.frames, curve.low, curve.high, color=style.colour, alpha=0.15, linewidth=0)
+    axis.plot(curve.frames, curve.center, label=label, markevery=max(len(curve.frames) // 6, 1), **style.line)
 
 
 def _scatter(axis: Axes, rows: Sequence[TransitionRow], low: float, high: float) -> None:
@@ -320,10 +305,10 @@ def _expert_line(axis: Axes, value: float) -> float:
     return value
 
 
-def _count(word: str, groups: Mapping[Any, Sized]) -> str:
-    """The range of the groups' sizes, such as "2 to 3 seeds"."""
-    counts = sorted({len(group) for group in groups.values()})
-    return f"{' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} {word}{'s' * (counts[-1] > 1)}"
+def _counted(counts: Sequence[int], word: str) -> str:
+    """The range of some counts, such as "2 to 3 seeds"."""
+    ends = dict.fromkeys([min(counts), max(counts)])
+    return f"{' to '.join(map(str, ends))} {word}{'s' * (max(counts) > 1)}"
 
 
 def _label_axes(axis: Axes, title: str, ylabel: str, drawn: Sequence[float]) -> None:

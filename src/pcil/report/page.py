@@ -9,9 +9,11 @@ from pathlib import Path
 from jinja2 import Environment
 
 from pcil.errors import InputError, shown
-from pcil.report import figures, tables
+from pcil.report import charts, figures, tables
 from pcil.report.load import Collection, write_rows
 
+WEB = Path(__file__).with_name("web")
+"""The template of the page, what it is drawn with, and the chart library uPlot."""
 TITLE = "<title>pcil report"
 """The text that identifies a page as a report."""
 
@@ -45,6 +47,7 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     write_rows(out / "tables" / "evaluations.csv", found.rows)
     if found.transitions:
         write_rows(out / "tables" / "transitions.csv", found.transitions)
+    figures.learning_curves(found, out / "figures")
     drawn = {
         tables.title_and_caption(make): {title: _uri("svg+xml", svg.encode()) for title, svg in pictures.items()}
         for make in figures.FIGURES
@@ -52,12 +55,14 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     }
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"cell": tables.cell, "shown": lambda value: shown(str(value), 500)}
-    page = environment.from_string(Path(__file__).with_name("page.html").read_text()).render(
+    page = environment.from_string((WEB / "page.html").read_text()).render(
         tasks=list(dict.fromkeys(row.task for row in found.rows)),
         methods=list(dict.fromkeys(row.method for row in found.rows)),
         found=found,
         last={row[:4]: row for row in found.rows},
         tables=[(name, *tables.title_and_caption(tables.MAKERS[name]), table) for name, table in written.items()],
+        charts=charts.of(found),
+        web={name: (WEB / name).read_text() for name in ("uplot.css", "uplot.js", "charts.js")},
         figures=drawn,
         films={title: _uri("webp", film) for title, film in films.items()},
     )

@@ -6,14 +6,15 @@ stratified: it draws seeds with replacement within each task (Agarwal et al. 202
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
 
-from pcil.report.load import EvalRow
+from pcil.report.load import EvalRow, by_variant, matrix
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -31,6 +32,15 @@ class Interval(NamedTuple):
         if any(map(math.isnan, (*self, *other))):
             return None
         return self.low <= other.high and other.low <= self.high
+
+
+class Curve(NamedTuple):
+    """A line over frames and the bounds of its interval, all `[frames]`; unknown bounds are NaN."""
+
+    frames: np.ndarray
+    center: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 def mean_interval(scores: Sequence[float] | np.ndarray) -> Interval:
@@ -84,6 +94,28 @@ def share_of_expert(runs: Sequence[Sequence[EvalRow]], scores: np.ndarray) -> np
     """Scores, with one row for each run, divided by the demonstrations' return; None if that is unknown or not positive."""
     experts = np.array([run[-1].expert_return or 0 for run in runs])
     return None if experts.min() <= 0 else (scores.T / experts).T
+
+
+def curve(runs: Sequence[Sequence[EvalRow]], value: str = "return_mean") -> Curve:
+    """The mean over seeds at the frames that all have, with Student's 95% interval; the bounds of a single seed are NaN."""
+    frames, values = matrix(runs, value)
+    return Curve(frames, *np.array([mean_interval(column) for column in values.T]).reshape(-1, 3).T)
+
+
+def share_curves(rows: Iterable[EvalRow]) -> dict[tuple[str, str], tuple[Curve, int]]:
+    """Of each method and variant: the IQM over seeds and tasks of the share of the expert's return, at the frames that all of
+    them have, with a bootstrap interval, and the number of tasks whose expert is known."""
+    strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
+    for name, runs in by_variant(rows).items():
+        frames, returns = matrix(runs)
+        if (share := share_of_expert(runs, returns)) is not None:
+            strata.setdefault(name[1:], []).append((frames, share))
+    found = {}
+    for name, tasks in strata.items():
+        frames = functools.reduce(np.intersect1d, [own for own, _ in tasks])
+        scores = [share[:, np.isin(own, frames)] for own, share in tasks]
+        found[name] = Curve(frames, iqm(*scores), *bootstrap(iqm, scores)), len(tasks)
+    return found
 
 
 def first_reach(run: Sequence[EvalRow], share: float) -> EvalRow | None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 
 import pytest
+from test_figures import curve
 
 from pcil.report import charts
 from pcil.report.load import Collection
-from test_figures import curve
 
 
 def made(rows: list) -> dict[str, dict]:

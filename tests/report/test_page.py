@@ -84,7 +84,9 @@ def test_the_page_needs_nothing_but_itself(report: Path) -> None:
     text = report.read_text()
     seen = Page(text)
     assert seen.open == [] and seen.tags.count("script") == 3
-    assert len(seen.sources) == 1 + 1 + 3 + 1, "curves for readers without scripts, health, t-SNE of three tasks, a film"
+    assert len(seen.sources) == 1 + 1 + 1 + 3 + 1, (
+        "curves without scripts, profiles, health, three t-SNE, a film"
+    )
     assert seen.sources[0] == "figures/curves.png" and (report.parent / seen.sources[0]).is_file()
     assert all(source.startswith("data:image/") for source in seen.sources[1:])
     for target in seen.targets:
@@ -117,12 +119,12 @@ def test_it_says_what_was_found(report: Path) -> None:
 
 
 def test_figures_and_tables_lie_beside_it(report: Path) -> None:
-    names = {"aggregate", "curves", "health", "representation"}
+    names = {"aggregate", "curves", "profiles", "health", "representation"}
     for task in ("hopper_stand", "walker_run", "my_module_MyTask-v0"):
         names |= {f"curves-{task}", f"representation-{task}"}
     files = {path.name for path in (report.parent / "figures").iterdir()}
     assert files == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
-    tables = {"overview", "aggregate", "finals", "paper", "efficiency", "improvement", "health", "representation"}
+    tables = {"overview", "aggregate", "finals", "paper", "efficiency", "improvement", "comparison", "health", "representation"}
     files = {path.name for path in (report.parent / "tables").iterdir()}
     assert files == {f"{name}.{kind}" for name in tables for kind in ("csv", "md")} | {"evaluations.csv", "transitions.csv"}
 
@@ -196,7 +198,7 @@ def test_the_page_in_a_browser(size: tuple[int, int], scheme: Any, report: Path)
         assert window.title().startswith("pcil report") and said == []
         assert {url for url in asked if not url.startswith("data:")} == {report.as_uri()}
         images = window.evaluate("[...document.images].map(i => [i.complete, i.naturalWidth, i.getBoundingClientRect().width])")
-        assert len(images) == 5 and all(done and width > 0 and shown > 0 for done, width, shown in images)
+        assert len(images) == 6 and all(done and width > 0 and shown > 0 for done, width, shown in images)
 
         def overflow() -> list[str]:
             """Elements that extend beyond the window, except inside elements with their own scroll bars."""

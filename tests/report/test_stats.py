@@ -9,6 +9,7 @@ from pathlib import Path
 import hypothesis.extra.numpy as arrays
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import ttest_1samp
@@ -165,3 +166,58 @@ def test_each_seed_is_measured_by_its_own_expert(tmp_path: Path) -> None:
     runs = [read_run(fake_run(tmp_path / str(expert), [1], expert=expert)) for expert in (100.0, 200.0)]
     share = stats.share_of_expert(runs, np.array([[50.0, 100.0], [50.0, 100.0]]))
     assert share is not None and share.tolist() == [[0.5, 1.0], [0.25, 0.5]]
+
+
+# --- Comparisons ---
+
+
+def test_welchs_test_by_hand() -> None:
+    """Of 1, 2, 3 and 5, 9: difference -5, variances 1/3 and 8/2, so t = -5 / sqrt(13/3) with 1.170 degrees of freedom."""
+    between, chance = stats.difference(np.array([1.0, 2.0, 3.0]), np.array([5.0, 9.0]))
+    error, freedom = (1 / 3 + 4) ** 0.5, (1 / 3 + 4) ** 2 / ((1 / 3) ** 2 / 2 + 4**2 / 1)
+    assert chance == pytest.approx(2 * scipy.stats.t.cdf(-5 / error, freedom))
+    half = scipy.stats.t.ppf(0.975, freedom) * error
+    assert between == (-5, pytest.approx(-5 - half), pytest.approx(-5 + half))
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [([1.0], [2.0, 3.0]), ([1.0, 2.0], [3.0]), ([1.0, 1.0], [2.0, 2.0])])
+def test_too_little_for_a_test_gives_none(ours: list[float], theirs: list[float]) -> None:
+    between, chance = stats.difference(np.array(ours), np.array(theirs))
+    assert np.isnan(chance) and np.isnan(between[1:]).all() and between.value == np.mean(ours) - np.mean(theirs)
+
+
+def test_holms_correction_by_hand() -> None:
+    """Of .01, .04, .03 and .005: .005 * 4, .01 * 3, .03 * 2, and .04 * 1, which is raised to the .06 before it."""
+    assert stats.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert stats.holm([0.9, 0.8]) == [1, 1] and stats.holm([]) == []
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=8))
+def test_holms_correction_is_the_naive_one(chances: list[float]) -> None:
+    """A test is rejected at a level if it, and each with a smaller p-value, is at most the level over the number left."""
+
+    def rejected(level: float) -> set[int]:
+        found: set[int] = set()
+        for number, i in enumerate(sorted(range(len(chances)), key=chances.__getitem__)):
+            if chances[i] > level / (len(chances) - number):
+                break
+            found.add(i)
+        return found
+
+    adjusted = stats.holm(chances)
+    for level in (0.01, 0.05, 0.3):
+        assert rejected(level * (1 - 1e-9)) <= {i for i, p in enumerate(adjusted) if p <= level} <= rejected(level * (1 + 1e-9))
+
+
+def test_the_area_is_the_mean_height_of_the_curve() -> None:
+    """0, 1, 1 at 0, 1000, 4000: a triangle of 500 and a rectangle of 3000, over 4000 frames."""
+    frames = np.array([0, 1000, 4000])
+    assert stats.area(frames, np.array([[0.0, 1.0, 1.0], [2.0, 2.0, 2.0]])) == pytest.approx([3500 / 4000, 2])
+    assert stats.area(frames[:1], np.array([[0.3], [0.4]])).tolist() == [0.3, 0.4]
+
+
+def test_a_profile_is_the_share_of_runs_at_each_level() -> None:
+    """One task of two seeds with 0.5 and 1, one of three with 0, 0.5 and 0.9; the mean over tasks."""
+    found = stats.profile([np.array([0.5, 1.0]), np.array([0.0, 0.5, 0.9])], np.array([0.0, 0.5, 0.6, 1.0]))
+    assert found.center == pytest.approx([1, (1 + 2 / 3) / 2, (1 / 2 + 1 / 3) / 2, (1 / 2 + 0) / 2])
+    assert (found.low <= found.center).all() and (found.center <= found.high).all() and found.low[0] == found.high[0] == 1

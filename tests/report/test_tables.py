@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 
 import pytest
+import scipy.stats
 
 from fake_runs import fake_run, fake_sweep
 from pcil.report import tables
@@ -88,8 +89,9 @@ def test_the_papers_table_is_copied_without_a_slip() -> None:
 def test_all_tasks_together(sweep: Collection) -> None:
     """PCIL's fractions are 0.25, 0.5, 0.75 and 0.7, 0.8, 0.9: mean 0.65; IQM, without the lowest and the highest, 0.6875."""
     table = tables.aggregate(sweep)
-    assert [row[:2] + row[4:] for row in table.rows] == [("pcil", "default", 2, 6), ("dac", "default", 2, 6)]
-    (mean, iqm), (half_mean, half_iqm) = (row[2:4] for row in table.rows)
+    assert [row[:2] + row[5:] for row in table.rows] == [("pcil", "default", 2, 6), ("dac", "default", 2, 6)]
+    (mean, iqm, area), (half_mean, half_iqm, _) = (row[2:5] for row in table.rows)
+    assert area.value == pytest.approx(0.65 / 2), "0, half of the end, and the end: half of it on average"
     assert (mean.value, iqm.value) == pytest.approx((0.65, 0.6875))
     assert (half_mean.value, half_iqm.value) == pytest.approx((0.325, 0.34375))
     assert 0.475 <= mean.low < mean.value < mean.high <= 0.825, "all lowest and all highest seeds"
@@ -111,6 +113,18 @@ def test_probability_of_improvement(sweep: Collection) -> None:
     ((*names, chance, tasks),) = tables.improvement(sweep).rows
     assert names == ["pcil", "default", "dac", "default"] and tasks == 2
     assert chance.value == pytest.approx((7.5 / 9 + 1) / 2) and chance.low < chance.value < chance.high == 1
+
+
+def test_comparisons_by_task(sweep: Collection) -> None:
+    """100, 200, 300 against 50, 100, 150 and 700, 800, 900 against 350, 400, 450, by SciPy; the smaller p-value is doubled."""
+    table = tables.comparison(sweep)
+    finals = [([100, 200, 300], [50, 100, 150]), ([700, 800, 900], [350, 400, 450])]
+    tests = [scipy.stats.ttest_ind(*pair, equal_var=False).pvalue for pair in finals]
+    assert [row[0] for row in table.rows] == ["hopper_stand", "walker_run"]
+    assert [row[5].value for row in table.rows] == [100, 400]
+    assert [row[6] for row in table.rows] == [f"{p:.2g}" for p in tests]
+    assert [row[7] for row in table.rows] == [f"{tests[0]:.2g}", f"{2 * tests[1]:.2g}"] and tests[1] < tests[0] / 2
+    assert all(row[8] == "3 and 3" for row in table.rows)
 
 
 def test_methods_are_compared_at_the_frames_that_both_have(tmp_path: Path) -> None:

@@ -99,6 +99,28 @@ def learning_curves(found: Collection, folder: Path) -> None:
     aggregate(found.rows, folder / "aggregate", styles)
 
 
+def profiles(found: Collection, folder: Path) -> dict[str, str]:
+    """Performance profiles: the share of runs whose final return is at least so large a part of the demonstrations' return.
+
+    It is averaged over each method's own tasks, with a bootstrap interval as a band. A line that is higher everywhere is a
+    better method.
+    """
+    styles, shares = assign_styles(found.rows), {}
+    for name, runs in by_variant(found.rows).items():
+        final = matrix(runs)[1][:, -1]
+        if (share := stats.share_of_expert(runs, final)) is not None:
+            shares.setdefault(name[1:], []).append(share)
+    if not any(sum(map(len, own)) > 1 for own in shares.values()):
+        return {}
+    figure, (axis,) = _axes(1, 1, (6.0, 3.6))
+    levels = np.linspace(0, 1.1, 111)
+    for name in (name for name in styles if name in shares):
+        _band_line(axis, stats.profile(shares[name], levels), styles[name], escape_label(label(name, styles)))
+    axis.set(xlabel="share of the demonstrations' return", ylabel="share of runs", ylim=(-0.02, 1.02))
+    axis.spines[["top", "right"]].set_visible(False)
+    return {"all tasks": save(figure, folder / "profiles")}
+
+
 def reward_health(found: Collection, folder: Path) -> dict[str, str]:
     """Reward health: correlation of the learned with the true reward over the steps of an episode.
 
@@ -120,7 +142,7 @@ def t_sne(found: Collection, folder: Path) -> dict[str, str]:
     return {task: scatter_grid(rows, folder / f"representation-{file}", columns=2) for task, file, rows in tasks}
 
 
-FIGURES: list[Callable[[Collection, Path], dict[str, str]]] = [reward_health, t_sne]
+FIGURES: list[Callable[[Collection, Path], dict[str, str]]] = [profiles, reward_health, t_sne]
 """What draws each kind of figure of a report's page into a folder, and returns its figures as SVG, by title."""
 
 

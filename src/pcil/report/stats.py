@@ -77,6 +77,48 @@ def probability_of_improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.n
     return interval(chance, [*ours, *theirs])
 
 
+def difference(ours: np.ndarray, theirs: np.ndarray) -> tuple[Interval, float]:
+    """The difference of the means of two methods' seeds with Welch's 95% interval, and the p-value of Welch's t-test.
+
+    Both are NaN where a method has one seed, or where neither varies.
+    """
+    middle = float(np.mean(ours) - np.mean(theirs))
+    if min(len(ours), len(theirs)) < 2 or np.ptp(ours) == np.ptp(theirs) == 0:
+        return Interval(middle, math.nan, math.nan), math.nan
+    test: Any = stats.ttest_ind(ours, theirs, equal_var=False)
+    low, high = test.confidence_interval(LEVEL)
+    return Interval(middle, float(low), float(high)), float(test.pvalue)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's (1979) adjusted p-values of a family of tests, in their order: the i-th smallest of m is multiplied by m - i + 1,
+    and is at least the one before it and at most 1."""
+    order = np.argsort(p_values, kind="stable")
+    factors = np.arange(len(order), 0, -1)
+    adjusted = np.empty(len(order))
+    adjusted[order] = np.minimum(np.maximum.accumulate(factors * np.asarray(p_values, float)[order]), 1)
+    return adjusted.tolist()
+
+
+def area(frames: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """The mean height of each curve `[seeds, F]` over its frames, by the trapezoidal rule: the area under it per frame."""
+    if len(frames) < 2:
+        return values[:, -1]
+    return np.trapezoid(values, frames, axis=1) / (frames[-1] - frames[0])
+
+
+def profile(shares: Sequence[np.ndarray], levels: np.ndarray) -> Curve:
+    """A performance profile (Agarwal et al. 2021): the share of runs whose score is at least each of the `levels`, averaged
+    over tasks, with a bootstrap interval. `shares` are the scores `[seeds]` of each task."""
+    reached = [(scores[:, None] >= levels).astype(float) for scores in shares]
+    return Curve(levels, mean_of_tasks(*reached), *bootstrap(mean_of_tasks, reached))
+
+
+def mean_of_tasks(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
+    """The mean over seeds, averaged over tasks."""
+    return np.asarray(np.mean([scores.mean(axis=axis) for scores in strata], axis=0))
+
+
 def bootstrap(statistic: Callable[..., Any], strata: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the percentile interval of `statistic(*strata, axis=...)`, for each index of the trailing axes.
 

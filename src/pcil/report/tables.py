@@ -98,17 +98,23 @@ def paper(found: Collection) -> Table:
 def aggregate(found: Collection) -> Table:
     """All tasks together: final return as a share of the demonstrations' return, over all seeds and tasks of a method.
 
-    The bootstrap intervals draw seeds within each task. Compare methods only if they have the same tasks and the same number
-    of frames.
+    The area is that under the learning curve of this share, divided by the frames; a method that takes no step in the
+    environment has none. The bootstrap intervals draw seeds within each task. Compare methods only if they have the same tasks
+    and the same number of frames.
     """
     rows = []
     for name, tasks in _by_method(found.rows).items():
-        shares = (stats.share_of_expert(runs, _final(runs)[1]) for runs in tasks.values())
-        if not (scores := [share for share in shares if share is not None]):
+        curves = [(frames, stats.share_of_expert(runs, values)) for runs in tasks.values() for frames, values in [matrix(runs)]]
+        known = [(frames, share) for frames, share in curves if share is not None]
+        if not known:
             continue
-        mean, iqm = (stats.interval(statistic, scores) for statistic in (_mean_of_tasks, stats.iqm))
-        rows.append((*name, mean, iqm, len(scores), sum(map(len, scores))))
-    return Table(("method", "variant", "mean", "IQM", "tasks", "runs"), rows)
+        scores, areas = [share[:, -1] for _, share in known], [stats.area(*curve) for curve in known]
+        mean, iqm = (stats.interval(statistic, scores) for statistic in (stats.mean_of_tasks, stats.iqm))
+        area = stats.interval(stats.mean_of_tasks, areas)
+        if name[0] in OFFLINE:
+            area = stats.Interval(math.nan, math.nan, math.nan)
+        rows.append((*name, mean, iqm, area, len(scores), sum(map(len, scores))))
+    return Table(("method", "variant", "mean", "IQM", "area", "tasks", "runs"), rows)
 
 
 def efficiency(found: Collection) -> Table:
@@ -147,6 +153,32 @@ def improvement(found: Collection) -> Table:
     return Table(("method", "variant", "over method", "over variant", "probability", "tasks"), rows)
 
 
+def comparison(found: Collection) -> Table:
+    """Comparisons by task: the difference of two methods' mean returns, with Welch's 95% interval.
+
+    Holm's correction holds the chance of any false difference between two methods, over all of their common tasks, below the
+    corrected p-value. Returns are those of the last evaluation that both methods have. Only tasks with at least two seeds of
+    both are compared.
+    """
+    rows = []
+    for (ours, x), (theirs, y) in itertools.combinations(_by_method(found.rows).items(), 2):
+        tested = []
+        for task in (task for task in x if task in y):
+            if pair := _at_the_same_frames(x[task], y[task]):
+                between, chance = stats.difference(*pair)
+                if not math.isnan(chance):
+                    tested.append((task, between, chance, f"{len(pair[0])} and {len(pair[1])}"))
+        adjusted = stats.holm([chance for _, _, chance, _ in tested])
+        for (task, between, chance, seeds), corrected in zip(tested, adjusted, strict=True):
+            rows.append((task, *ours, *theirs, between, _p_value(chance), _p_value(corrected), seeds))
+    columns = ("method", "variant", "over method", "over variant", "difference", "p", "p (Holm)", "seeds")
+    return Table(("task", *columns), rows)
+
+
+def _p_value(chance: float) -> str:
+    return f"{chance:.2g}" if chance >= 1e-4 else "< 0.0001"
+
+
 def health(found: Collection) -> Table:
     """Health of the learned reward: its correlation with the true reward over the steps of a training episode.
 
@@ -181,7 +213,8 @@ def representation(found: Collection) -> Table:
 
 Maker = Callable[[Collection], Table]
 MAKERS: dict[str, Maker] = {
-    make.__name__: make for make in (overview, aggregate, finals, paper, efficiency, improvement, health, representation)
+    make.__name__: make
+    for make in (overview, aggregate, finals, paper, efficiency, improvement, comparison, health, representation)
 }
 
 
@@ -252,7 +285,3 @@ def _by_method(rows: Sequence[EvalRow]) -> dict[Any, dict[str, list[list[EvalRow
     for (task, *name), runs in by_variant(rows).items():
         found.setdefault(tuple(name), {})[task] = runs
     return found
-
-
-def _mean_of_tasks(*strata: np.ndarray, axis: int = 0) -> np.ndarray:
-    return np.asarray(np.mean([scores.mean(axis=axis) for scores in strata], axis=0))

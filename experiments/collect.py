@@ -21,6 +21,8 @@ def main(target: str, *folders: str) -> None:
         run = renamed(json.loads((folder / "run.json").read_text())["run"])
         now, before = flat(run), flat(presets.make(run["task"], run["method"], run["preset"]).to_json())
         unnamed = {*NO_VARIANT, "frames", "agent.absorbing"}  # the last was decided when the run began
+        if before.get("agent.cloning", False) is None and (now["agent.cloning"] or now["demos"] is None):
+            unnamed.add("agent.cloning")  # decided too
         differing = (name for name in now if now[name] != before.get(name) and name not in unnamed)
         told = [f"{name}={now[name]}" for name in differing]
         rows += read_run(folder, ", ".join([run["preset"], *told]))

@@ -352,7 +352,7 @@ def test_the_same_command_again_says_that_it_is_done(run: Path, demos: str, caps
 def test_the_command_line_and_python_mean_the_same_run(run: Path, demos: str) -> None:
     assert (
         json.loads((run / "run.json").read_text())["run"]
-        == changed(small_run(demos=demos), {"agent.absorbing": False}).to_json()
+        == changed(small_run(demos=demos), {"agent.absorbing": False, "agent.cloning": True}).to_json()
     )
 
 

@@ -84,9 +84,7 @@ def test_the_page_needs_nothing_but_itself(report: Path) -> None:
     text = report.read_text()
     seen = Page(text)
     assert seen.open == [] and seen.tags.count("script") == 3
-    assert len(seen.sources) == 1 + 1 + 1 + 3 + 1, (
-        "curves without scripts, profiles, health, three t-SNE, a film"
-    )
+    assert len(seen.sources) == 1 + 1 + 1 + 3 + 1, "curves without scripts, profiles, health, three t-SNE, a film"
     assert seen.sources[0] == "figures/curves.png" and (report.parent / seen.sources[0]).is_file()
     assert all(source.startswith("data:image/") for source in seen.sources[1:])
     for target in seen.targets:

@@ -115,7 +115,7 @@ def test_settings_that_do_not_exist_are_refused_with_those_that_do(name: str) ->
 def test_unknown_names_are_refused_with_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"no method 'gail'.*pcil, dac, .*expert"):
         presets.make("walker_walk", "gail")
-    with pytest.raises(InputError, match=r"no preset 'best'.*default, paper, released"):
+    with pytest.raises(InputError, match=r"no preset 'best'.*default, reward-only, paper, released"):
         presets.make("walker_walk", "pcil", "best")
 
 

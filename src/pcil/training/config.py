@@ -54,7 +54,8 @@ class Run:
     method: str = "pcil"
     """Name of the method; it chooses the reward and its settings."""
     preset: str = "default"
-    """default: what our measurements favour; paper: the paper's text; released: what the authors' code does."""
+    """default: what our measurements favour; reward-only: the same without the demonstrations' actions; paper: the paper's
+    text; released: what the authors' code does."""
     env_kwargs: EnvKwargs = field(default_factory=dict, hash=False)
     """Keyword arguments of the environment as a JSON object, such as '{"frame_skip": 5}'; they are given to gymnasium.make."""
     seed: int = 1

@@ -5,7 +5,8 @@ STAMP := .venv/.ready
 
 # make mutants FILES="losses noise" N=200: shows which changes of the source no test notices (docs/mutants.md)
 # make fuzz N=2000, make kills N=100: test randomly changed inputs, and runs that are killed and damaged (docs/reliability.md)
-.PHONY: setup train test test-slow mutants fuzz kills check bench docs format clean
+# make archive: the results of this commit for a release, in dist/
+.PHONY: setup train test test-slow mutants fuzz kills check bench archive docs format clean
 
 setup: $(STAMP)
 
@@ -40,6 +41,9 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/pcil bench
+
+archive: $(STAMP)
+	$(BIN)/python experiments/archive.py
 
 docs: $(STAMP)
 	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs --extra report --extra sweep --extra onnx --extra film --extra lerobot --extra wandb --extra mlflow --inexact --quiet

@@ -145,6 +145,7 @@ def test_the_averaged_actor_is_evaluated_and_saved(demos: str, tmp_path: Path) -
     returns = {}
     for rate in (1e-20, 1.0):
         agent = dataclasses.replace(small_run().agent, averaging_rate=rate, normalize_observations=False, learning_rate=1e-2)
+        agent = dataclasses.replace(agent, cloning=False)
         finish(small_run(demos=demos, agent=agent), tmp_path / str(rate))
         table = rows(tmp_path / str(rate))[0][1:]
         returns[rate] = {tuple(row[2] for row in table if row[0] == frames) for frames in ("0", "300")}
@@ -710,7 +711,7 @@ def test_a_checkpoint_of_other_shapes_is_refused(demos: str, tmp_path: Path) -> 
     run, folder = small_run(demos=demos), tmp_path / "run"
     with pytest.raises(loop.Stopped):
         runs.execute(run, folder, [StopAfter(1)])
-    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24, absorbing=False))
+    other = dataclasses.replace(run, agent=dataclasses.replace(run.agent, hidden=24, absorbing=False, cloning=True))
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(about | {"run": other.to_json()}))
     before = (folder / "train.jsonl").read_bytes()

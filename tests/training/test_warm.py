@@ -15,7 +15,8 @@ from pcil.policy import load_policy
 from pcil.training import checkpoint, loop, runs, state, warm
 from pcil.training.config import Run, changed
 from pcil.types import Spec
-from small import save_point_mass_demos, small_run
+from small import save_point_mass_demos
+from small import small_run as default_run
 
 SPEC = Spec(2, 2, 1)
 
@@ -23,6 +24,12 @@ SPEC = Spec(2, 2, 1)
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> str:
     return save_point_mass_demos(tmp_path_factory.mktemp("demos"))
+
+
+def small_run(method: str = "pcil", **changes: Any) -> Run:
+    """A small run that evaluates the actor itself; `default` evaluates its average."""
+    run = default_run(method, **changes)
+    return changed(run, {"agent.averaging_rate": 1.0} if method != "bc" else {})
 
 
 @pytest.fixture(scope="module")

@@ -52,3 +52,11 @@ def test_penalty_keeps_the_slope_near_one() -> None:
         gaps.append(float(metrics["expert_logit"] - metrics["agent_logit"]))
     distance = float(np.linalg.norm(expert.obs.mean(0) - agent.obs.mean(0)))
     assert gaps[1] < 2 * distance < gaps[0]
+
+
+def test_the_accuracy_counts_rows_on_their_side_of_zero() -> None:
+    """With the state itself as the logit; a logit of 0 is on neither side."""
+    discriminator = MLP((jnp.ones((1, 1)),), (jnp.zeros(1),))
+    expert, agent = jnp.array([[2.0], [0.0], [-1.0], [3.0]]), jnp.array([[-2.0], [0.0], [0.0], [1.0]])
+    _, metrics = SETTINGS.loss(discriminator, expert, agent, key=jax.random.key(0))
+    assert float(metrics["accuracy"]) == (2 / 4 + 1 / 4) / 2

@@ -611,7 +611,7 @@ cluster.shutdown()
 def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, tmp_path: Path) -> None:
     """Two nodes with a core each. The worker of one run and then the node of the other are killed; both runs end normally."""
     text = f"{PRODUCT.replace('[1, 2]', '[1, 2, 3]').replace('300', '6000')}[settings]\ndemos = '{demos}'\n"
-    jobs = plan(f"{text}checkpoint_seconds = 0\n{NARROW.replace('every = 100', 'every = 2000')}").jobs
+    jobs = plan(f"{text}checkpoint_seconds = 0.0\n{NARROW.replace('every = 100', 'every = 2000')}").jobs
     nodes = session.start("-c", NODES)
     lines = iter(nodes.stdout.readline, "")
     address, raylet = next(line.split()[1:] for line in lines if line.startswith("at "))
@@ -641,7 +641,7 @@ def test_runs_outlive_their_worker_and_their_node(demos: str, session: Session, 
 @pytest.mark.slow
 def test_whatever_is_killed_the_same_command_finishes_everything(demos: str, session: Session, tmp_path: Path) -> None:
     """Kills a run, then the sweep itself, then all processes at once, as if the machine went down; nothing is left behind."""
-    text = f"{PRODUCT.replace('300', '10000')}[settings]\ndemos = '{demos}'\ncheckpoint_seconds = 0\n"
+    text = f"{PRODUCT.replace('300', '10000')}[settings]\ndemos = '{demos}'\ncheckpoint_seconds = 0.0\n"
     jobs = plan(f"{text}{NARROW.replace('every = 100', 'every = 2000')}").jobs
     words = ["-m", "pcil", "sweep", "sweep.toml", "--out", "out", "--jobs", "2"]
 

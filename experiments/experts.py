@@ -53,19 +53,8 @@ def best(task: str, settings: dict[str, Any]) -> Path:
     finished = {}
     for seed in seeds:
         folder = RUNS / f"{task}-{seed}"
-        command = [
-            "train",
-            task,
-            "--method",
-            "expert",
-            "--preset",
-            "reward-only",
-            "--seed",
-            str(seed),
-            *options,
-            "--out",
-            str(folder),
-        ]
+        words = f"train {task} --method expert --preset reward-only --seed {seed}".split()
+        command = [*words, *options, "--out", str(folder)]
         subprocess.run([sys.executable, "-m", "pcil", *command], check=True)
         finished[folder] = runs.read_done(folder)
     return max(finished, key=lambda folder: finished[folder])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import itertools
 import math
 import statistics
@@ -17,16 +18,16 @@ from pcil.training.config import Run
 from pcil.training.evaluate import Evaluation
 
 
-class Numbers(Callback):
+class Numbers(Callback, abc.ABC):
     """Passes the numbers of a run on by name: those of each metrics row, with the prefix `episode/` where the name has none,
     and `evaluation/return` and `evaluation/success`, the means of an evaluation.
 
     A subclass defines `log`. Numbers that are not finite are left out.
     """
 
+    @abc.abstractmethod
     def log(self, numbers: dict[str, float], frames: int, seconds: float) -> None:
         """Numbers after `frames` frames and `seconds` of training."""
-        raise NotImplementedError
 
     def episode(self, row: dict[str, Any]) -> None:
         numbers = {name if "/" in name else f"episode/{name}": value for name, value in row.items() if isinstance(value, float)}

@@ -62,9 +62,9 @@ class Replay:
         """Whole episodes held."""
         return len(self._segments)
 
-    def num_windows(self, n: int) -> int:
-        """How many windows of `n` steps may be drawn."""
-        _, cumulative = self._starts(n)
+    def num_windows(self, n: int, every: int = 1) -> int:
+        """How many windows of `n` steps may be drawn; `every` as in `sample`."""
+        _, cumulative = self._starts(n, every)
         return int(cumulative[-1]) if len(cumulative) else 0
 
     def add(self, episode: Episode, reward: np.ndarray) -> None:
@@ -94,7 +94,7 @@ class Replay:
         actions and rewards behind it are 0, and its observations repeat the final one.
         """
         table, cumulative = self._starts(n, every)
-        total = int(cumulative[-1]) if len(cumulative) else 0
+        total = self.num_windows(n, every)
         if total == 0:
             raise InputError(f"The replay holds no window of {n} steps: every episode in it is shorter.")
         draw = rng.integers(total, size=batch)
@@ -138,7 +138,7 @@ class Replay:
     def _free(self) -> int:
         return self.capacity - sum(segment.length + 1 for segment in self._segments)
 
-    def _starts(self, n: int, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    def _starts(self, n: int, every: int) -> tuple[np.ndarray, np.ndarray]:
         """A row `(start, length, terminated, episode_id, first start, valid starts before)` an episode, and the running total
         of valid starts."""
         if (n, every) not in self._index:

@@ -60,3 +60,15 @@ def test_the_accuracy_counts_rows_on_their_side_of_zero() -> None:
     expert, agent = jnp.array([[2.0], [0.0], [-1.0], [3.0]]), jnp.array([[-2.0], [0.0], [0.0], [1.0]])
     _, metrics = SETTINGS.loss(discriminator, expert, agent, key=jax.random.key(0))
     assert float(metrics["accuracy"]) == (2 / 4 + 1 / 4) / 2
+
+
+def test_the_representation_is_the_last_hidden_layer() -> None:
+    """By a loop over the layers: the logit is linear in it."""
+    state = SETTINGS.init([random_batch(8, 5, 1, 1)], lambda x: x, key=jax.random.key(0))
+    discriminator, batch = state.discriminator, random_batch(8, 5, 1, 2)
+    layer = np.asarray(batch.next_obs)
+    for weight, bias in list(zip(discriminator.weights, discriminator.biases, strict=True))[:2]:
+        layer = np.maximum(layer @ np.asarray(weight) + np.asarray(bias), 0)
+    assert np.allclose(SETTINGS.representation(state, batch, lambda x: x), layer, atol=1e-5)
+    logit = layer @ np.asarray(discriminator.weights[2]) + np.asarray(discriminator.biases[2])
+    assert np.allclose(SETTINGS.reward(state, batch, lambda x: x, key=jax.random.key(0)), logit[:, 0], atol=1e-5)

@@ -57,7 +57,7 @@ def test_penalty_keeps_the_slope_near_one() -> None:
 def test_the_accuracy_counts_rows_on_their_side_of_zero() -> None:
     """With the state itself as the logit; a logit of 0 is on neither side."""
     discriminator = MLP((jnp.ones((1, 1)),), (jnp.zeros(1),))
-    expert, agent = jnp.array([[2.0], [0.0], [-1.0], [3.0]]), jnp.array([[-2.0], [0.0], [0.0], [1.0]])
+    expert, agent = jnp.array([[0.5], [0.0], [-1.0], [3.0]]), jnp.array([[-0.5], [0.0], [0.0], [0.5]])
     _, metrics = SETTINGS.loss(discriminator, expert, agent, key=jax.random.key(0))
     assert float(metrics["accuracy"]) == (2 / 4 + 1 / 4) / 2
 

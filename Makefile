@@ -5,8 +5,9 @@ STAMP := .venv/.ready
 
 # make mutants FILES="losses noise" N=200: shows which changes of the source no test notices (docs/mutants.md)
 # make fuzz N=2000, make kills N=100: test randomly changed inputs, and runs that are killed and damaged (docs/reliability.md)
+# make race: PCIL and other libraries, each on one core (docs/race.md); TASKS="walker_walk" MINUTES=10 for less
 # make archive: the results of this commit for a release, in dist/
-.PHONY: setup train test test-slow mutants fuzz kills check bench archive docs format clean
+.PHONY: setup train test test-slow mutants fuzz kills check bench race archive docs format clean
 
 setup: $(STAMP)
 
@@ -42,6 +43,15 @@ check: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/pcil bench
 
+.race/.ready: experiments/peers/requirements.txt
+	$(PYTHON) -m venv .race
+	.race/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+	touch $@
+
+race: $(STAMP) .race/.ready
+	$(BIN)/python experiments/race.py $(if $(TASKS),--tasks $(TASKS)) $(if $(MINUTES),--minutes $(MINUTES))
+	$(BIN)/python experiments/race.py --costs
+
 archive: $(STAMP)
 	$(BIN)/python experiments/archive.py
 
@@ -54,4 +64,4 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf .venv .pytest_cache .ruff_cache .hypothesis site
+	rm -rf .venv .race .pytest_cache .ruff_cache .hypothesis site

@@ -12,6 +12,8 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import race
+
 from pcil.demos.inspect import shipped
 from pcil.report import figures, tables
 from pcil.report.load import Collection, EvalRow, TransitionRow, read_rows
@@ -26,7 +28,7 @@ def main(words: list[str]) -> int:
 
     def fresh(mark: re.Match[str]) -> str:
         name, _, file = mark[2].partition(":")
-        return mark[1] + (tables.markdown(tables.MAKERS[name](results(file))) if file else demos_table()) + mark[3]
+        return mark[1] + (tables.markdown(MAKERS[name](results(file))) if file else PLAIN[name]()) + mark[3]
 
     stale = 0
     for page in PAGES:
@@ -37,9 +39,12 @@ def main(words: list[str]) -> int:
             page.write_text(filled)
     if "--check" in words:
         return int(stale > 0)
-    for file in sorted((ROOT / "results").iterdir()):
+    for file in sorted(file for file in (ROOT / "results").iterdir() if file.suffix != ".json"):
         found, path = results(file.stem), ROOT / "docs" / "figures" / file.stem
-        _ = figures.scatter_grid(found.transitions, path) if found.transitions else figures.grid(found.rows, path)
+        if file == race.ROWS:
+            race.draw(found, path)
+        else:
+            _ = figures.scatter_grid(found.transitions, path) if found.transitions else figures.grid(found.rows, path)
         print(path.relative_to(ROOT))
     return 0
 
@@ -63,6 +68,10 @@ def demos_table() -> str:
         rows.append((row["task"], row["observation_dim"], row["action_dim"], row["episodes"], returns, *bounds, row["expert"]))
     header = ("task", "observation", "action", "episodes", "return", "minimum", "maximum", "expert")
     return tables.markdown(tables.Table(header, rows))
+
+
+MAKERS = {**tables.MAKERS, "race": race.table}
+PLAIN = {"demos": demos_table, "race-costs": lambda: tables.markdown(race.costs_table())}
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import functools
 import json
 import math
 import numbers
@@ -83,9 +84,12 @@ def check_ranges(settings: Any, **ranges: tuple[float | int, float | int]) -> No
             raise InputError(f"{type(settings).__name__}.{name} is {value}; it must be {limits}.")
 
 
+_type_hints = functools.cache(typing.get_type_hints)
+
+
 def check_kinds(settings: Any) -> None:
     """Check that each field has the type of its annotation: a Literal, a number, text or a class; else `InputError`."""
-    hints = typing.get_type_hints(type(settings))
+    hints = _type_hints(type(settings))
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if not _fits(value, hint):

@@ -100,30 +100,48 @@ def of_table(source: str, table: dict[str, Any], out: Path, trust: Sequence[str]
     if not (1 <= plan.cores <= 10_000 and 0 <= plan.gpus <= 10_000):
         given = f"{brief(plan.cores)} cores and {brief(plan.gpus)} GPUs"
         raise InputError(f"{source} gives a run {given}; it needs 1 to 10,000 cores and 0 to 10,000 GPUs.")
-    read_once = functools.cache(runs.read_demonstrations)
-    for where, product in _products(source, table):
-        for name, settings in _combinations(where, product):
-            if any(job.name == name for job in plan.jobs):
-                raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
-            folder = out.absolute() / name
-            try:
-                if isinstance(given := settings.get("env_kwargs"), str):
-                    settings["env_kwargs"] = json_object("env_kwargs", given)
-                named = [("The task", modules.of_task(settings["task"], settings.get("env_kwargs")))]
-                named += [(f"--{part}", modules.of_class(settings.get(part), REGISTRIES[part])) for part in REGISTRIES]
-                for option, names in named:
-                    modules.admit(option, names, trust)
-                run = presets.make(**settings)
-                run = dataclasses.replace(run, task=envs.task_name(run.task))
-                runs.check(run, folder, read_once)
-            except InputError as error:
-                raise InputError(f"{where}, {name}: {error}") from error
-            own = tuple(dict.fromkeys(name for _, names in named for name in names))
-            plan.jobs.append(Job(name, folder, run, own, folder.with_name(f"{folder.name}.log")))
-            plan.jobs[-1].look()
+    read_once, taken = functools.cache(runs.read_demonstrations), set()
+    with _Environment() as environment:
+        for where, product in _products(source, table):
+            for name, settings in _combinations(where, product):
+                if name in taken:
+                    raise InputError(f"{where} has the run {name} a second time; give one of them a name under variants.")
+                taken.add(name)
+                folder = out.absolute() / name
+                try:
+                    if isinstance(given := settings.get("env_kwargs"), str):
+                        settings["env_kwargs"] = json_object("env_kwargs", given)
+                    named = [("The task", modules.of_task(settings["task"], settings.get("env_kwargs")))]
+                    named += [(f"--{part}", modules.of_class(settings.get(part), REGISTRIES[part])) for part in REGISTRIES]
+                    for option, names in named:
+                        modules.admit(option, names, trust)
+                    run = presets.make(**settings)
+                    run = dataclasses.replace(run, task=envs.task_name(run.task))
+                    runs.check(run, folder, read_once, environment.of(run))
+                except InputError as error:
+                    raise InputError(f"{where}, {name}: {error}") from error
+                own = tuple(dict.fromkeys(name for _, names in named for name in names))
+                plan.jobs.append(Job(name, folder, run, own, folder.with_name(f"{folder.name}.log")))
+                plan.jobs[-1].look()
     if not plan.jobs:
         raise InputError(f"{source} has no runs; give it tasks, methods and seeds, or [[runs]] with them.")
     return plan
+
+
+class _Environment(contextlib.ExitStack):
+    """The environment of one run after another: runs of the same one share it, and it is closed before another is made."""
+
+    _whose: tuple[str, str] | None = None
+
+    def of(self, run: Run) -> envs.Checked:
+        """The environment of a run."""
+        whose = run.task, json.dumps(run.env_kwargs)
+        if whose != self._whose:
+            self._whose = None
+            self.close()
+            self._environment = self.enter_context(envs.opened(run.task, env_kwargs=run.env_kwargs))
+            self._whose = whose
+        return self._environment
 
 
 def _products(file: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -224,9 +224,12 @@ def _claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-def check(run: Run, folder: Path, read: Callable[[str], Demonstrations] = read_demonstrations) -> None:
-    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there."""
-    run, demos, _ = prepared(run, read=read)
+def check(run: Run, folder: Path, read: Callable[[str], Demonstrations] = read_demonstrations, task: Any = None) -> None:
+    """Raise `InputError` where this run can't be done in `folder`: its demonstrations don't fit, or another run is there.
+
+    `read` and `task` are those of `prepared`.
+    """
+    run, demos, _ = prepared(run, read=read, task=task)
     _before(run, folder, demos)
 
 
@@ -240,7 +243,7 @@ def finished(folder: Path, run: Run) -> bool:
     return True
 
 
-def _description(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
+def described(run: Run, demos: Demonstrations | None) -> dict[str, Any]:
     """What a `run.json` says of the run, as JSON gives it back."""
     about = demos and {"hash": demos.hash, "episodes": len(demos.episodes), "return_mean": demos.return_mean}
     return {"run": run.to_json(), "demos": about}
@@ -250,7 +253,7 @@ def _describe(
     folder: Path, run: Run, demos: Demonstrations | None, before: dict[str, Any] | None, say: Callable[[str], None]
 ) -> None:
     """Write `run.json`, or bring the settings up to date in the one that was there `before`."""
-    description = _description(run, demos)
+    description = described(run, demos)
     versions = {"python": platform.python_version()}
     for name in PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):  # DeepMind Control may be absent
@@ -270,7 +273,7 @@ def _before(run: Run, folder: Path, demos: Demonstrations | None) -> dict[str, A
     """
     if not (folder / "run.json").exists():
         return None
-    description = _description(run, demos)
+    description = described(run, demos)
     try:
         before = files.read_json(folder / "run.json")
         settings, about = _completed(before["run"], run), before["demos"] or {}

@@ -5,7 +5,7 @@ STAMP := .venv/.ready
 
 # make mutants FILES="losses noise" N=200: shows which changes of the source no test notices (docs/mutants.md)
 # make fuzz N=2000, make kills N=100: test randomly changed inputs, and runs that are killed and damaged (docs/reliability.md)
-# make race: PCIL and other libraries, each on one core (docs/race.md); TASKS="walker_walk" MINUTES=10 for less
+# make race: PCIL and other libraries, each on one core (experiments/race.py); TASKS="walker_walk" MINUTES=10 for less
 # make archive: the results of this commit for a release, in dist/
 .PHONY: setup train test test-slow mutants fuzz kills check bench race archive docs format clean
 

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 import race
+import starts
 
 from pcil.demos.inspect import shipped
 from pcil.report import figures, tables
@@ -71,7 +72,11 @@ def demos_table() -> str:
 
 
 MAKERS = {**tables.MAKERS, "race": race.table}
-PLAIN = {"demos": demos_table, "race-costs": lambda: tables.markdown(race.costs_table())}
+PLAIN = {
+    "demos": demos_table,
+    "race-costs": lambda: tables.markdown(race.costs_table()),
+    "starts": lambda: tables.markdown(starts.table()),
+}
 
 
 if __name__ == "__main__":

@@ -189,3 +189,12 @@ def test_a_margin_within_the_window_is_refused(margin: int) -> None:
     with pytest.raises(InputError, match=rf"TCN.margin is {margin}; it must be at least 3"):
         TCN(negatives="rollout", window=2, margin=margin)
     assert TCN(window=2, margin=margin).margin == margin, "without negatives of the same rollout it has no effect"
+
+
+def test_the_representation_is_the_embedding_of_the_state_that_a_step_led_to() -> None:
+    batch = random_batch(8, 6, 1, 4)
+    batch = Batch(batch.obs, batch.action, batch.obs[::-1].copy())
+    state = SETTINGS.init([batch], itself, key=KEY)
+    raw = np.asarray(state.encoder(jnp.asarray(batch.next_obs)), np.float64)
+    got = SETTINGS.representation(state, batch, itself)
+    assert np.allclose(got, raw / np.linalg.norm(raw, axis=1, keepdims=True), atol=1e-5)

@@ -82,7 +82,8 @@ def manifest(root: Path, commit: str) -> dict[str, Any]:
             "runs": len({row[:4] for row in rows}),
             "commits": sorted(commits),
         }
-    commands = re.findall(r"^    ((?:pcil|python) .+)$", (root / "docs" / "results.md").read_text(), re.MULTILINE)
+    pages = [root / "docs" / "results.md", *sorted((root / "docs" / "results").glob("*.md"))]
+    commands = re.findall(r"^    ((?:pcil|python) .+)$", "\n".join(page.read_text() for page in pages), re.MULTILINE)
     return {
         "version": __version__,
         "commit": commit,

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from pcil import demos, envs
+from pcil.card import card
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
 from pcil.report.load import read_run, write_rows
@@ -106,7 +107,9 @@ def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int, minim
     fresh, target = place(task, recorded), demos.SHIPPED / "dmc" / task / "expert-v0"
     shutil.rmtree(target, ignore_errors=True)
     fresh.rename(target)
-    dataclasses.replace(policy, info=policy.info | info).save(POLICIES / task)
+    info = policy.info | info
+    dataclasses.replace(policy, info=info).save(POLICIES / task)
+    (POLICIES / task / "README.md").write_text(card(task, info, "mit", task))
     write_rows(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
 

@@ -7,11 +7,12 @@ import math
 from typing import Any
 
 
-def card(task: str, info: dict[str, Any]) -> str:
-    """The text of the card, from the content of `policy.json` alone; what `info` lacks is left out."""
+def card(task: str, info: dict[str, Any], licence: str | None = None, name: str = "FOLDER") -> str:
+    """The text of the card, from the content of `policy.json` alone; what `info` lacks is left out. `load_policy` finds the
+    policy by its `name`."""
     method = str(info.get("method", "policy"))
     front = {
-        "license": "unknown",
+        "license": licence or "unknown",
         "library_name": "pcil",
         "pipeline_tag": "reinforcement-learning",
         "tags": ["imitation-learning", "reinforcement-learning", method, task],
@@ -32,12 +33,12 @@ def card(task: str, info: dict[str, Any]) -> str:
     if "return_mean" in info:
         rows["return"] = _return(info)
     rows["command"] = _code(info.get("command") or _command(task, info))
-    rows["licence"] = "not chosen; whoever shares this policy chooses one, here and in `license` above"
+    rows["licence"] = licence or "not chosen; whoever shares this policy chooses one, here and in `license` above"
     lines = ["---", *(f"{name}: {json.dumps(value)}" for name, value in front.items()), "---", ""]  # JSON is YAML
     lines += [f"# {_plain(method)} on {_plain(task)}", "", "| | |", "|---|---|"]
     lines += [f"| {name} | {value} |" for name, value in rows.items()]
     lines += ["", "`pcil train --settings run.json --out DIR`, with the `run.json` of its run, trains it with every setting."]
-    lines += ["", "```python", "import pcil", "", 'policy = pcil.load_policy("FOLDER")', "action = policy(obs)", "```", ""]
+    lines += ["", "```python", "import pcil", "", f'policy = pcil.load_policy("{name}")', "action = policy(obs)", "```", ""]
     return "\n".join(lines)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pcil import demos, envs
+from pcil.card import card
 from pcil.demos import inspect
 from pcil.policy import load_policy
 
@@ -77,3 +78,10 @@ def test_the_table_says_where_it_comes_from(task: str) -> None:
     for name in ("command", "seed", "frames", "commit", "run"):
         assert about[name] == info[name]
     assert len(info["commit"].rstrip("+")) == 40 and info["command"] and info["run"]["method"] == "expert"
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_shipped_policy_has_its_card(task: str) -> None:
+    """`experiments/experts.py` writes it when it replaces a policy."""
+    folder = POLICIES / task
+    assert (folder / "README.md").read_text() == card(task, load_policy(task).info, "mit", task)

@@ -123,6 +123,10 @@ class WandB(Numbers):
         self._run.finish()
 
 
+MLFLOW_BATCH = 100
+"""The number of parameters that MLflow takes at once."""
+
+
 class MLflow(Numbers):
     """Logs to MLflow, in the experiment `pcil`, under the name of the run's folder; the steps are frames.
 
@@ -144,8 +148,9 @@ class MLflow(Numbers):
         else:
             name = folder.resolve().name
             self._id = self._client.create_run(experiment, tags={"pcil.id": number}, run_name=name).info.run_id
-            for setting, value in flat(run.to_json()).items():
-                self._client.log_param(self._id, setting, value)
+            params = [self._mlflow.entities.Param(name, str(value)) for name, value in flat(run.to_json()).items()]
+            for first in range(0, len(params), MLFLOW_BATCH):
+                self._client.log_batch(self._id, params=params[first : first + MLFLOW_BATCH])
         names = self._client.get_run(self._id).data.metrics
         self._logged = {(name, old.step) for name in names for old in self._client.get_metric_history(self._id, name)}
 

@@ -218,3 +218,28 @@ def test_slow_features_are_refreshed_when_it_is_their_turn() -> None:
         if updates:
             state, _ = update(potil, state, nothing, nothing, TRUNKS[updates])
         assert np.array_equal(state.space.embed.weight, TRUNKS[slow].weight)
+
+
+class Unit(POTIL):
+    """Each step of every episode costs 2."""
+
+    def costs(self, state: Any, batch: Any, embed: Any, *, key: Any) -> jax.Array:
+        return jnp.full(len(batch.obs), 2.0)
+
+
+def test_a_scale_below_1_counts_as_one_above() -> None:
+    """15 steps that cost 2 each sum to -1 with a scale of 1/30."""
+    settings = Unit(first_sum=-1.0)
+    state = settings.after_episode(SinkhornState(Demos.of(DEMOS), jnp.zeros(()), None), EPISODE, TRUNKS[0], key=KEY)
+    assert float(state.scale) == pytest.approx(1 / 30)
+    assert np.allclose(settings.reward(state, EPISODE, TRUNKS[0], key=KEY), np.full(15, -1 / 15))
+
+
+def test_rows_without_mass_cost_nothing_although_they_are_not_finite() -> None:
+    """Rows behind an episode's end have actions that are not numbers, and so have their costs."""
+    x, y = (np.random.default_rng(seed).normal(size=(6, 3)).astype(np.float32) for seed in (1, 2))
+    mass = jnp.full(6, 1 / 6)
+    alone = POTIL().match(jnp.asarray(x), jnp.asarray(y), mass, mass)
+    padded = jnp.asarray(np.concatenate([x, np.full((2, 3), np.nan, np.float32)]))
+    got = POTIL().match(padded, jnp.asarray(y), jnp.concatenate([mass, jnp.zeros(2)]), mass)
+    assert np.allclose(got, [*alone, 0, 0], atol=1e-6)

@@ -67,7 +67,6 @@ def default(task: str) -> dict[str, Any]:
         "agent.normalize_observations": True,  # ours: experts learn several times faster
         "agent.noise": LinearSchedule(1.0, 0.1, 30_000),  # ours
         "agent.cloning": None,  # ours: far fewer frames where demonstrations have actions
-        "agent.cloning_weight": LinearSchedule(100.0, 10.0, 20_000),  # ours: the critic is bad at first
         "agent.averaging_rate": 0.003,  # ours: the worst starts are better
     }
 

@@ -233,6 +233,7 @@ def test_a_scale_below_1_counts_as_one_above() -> None:
     state = settings.after_episode(SinkhornState(Demos.of(DEMOS), jnp.zeros(()), None), EPISODE, TRUNKS[0], key=KEY)
     assert float(state.scale) == pytest.approx(1 / 30)
     assert np.allclose(settings.reward(state, EPISODE, TRUNKS[0], key=KEY), np.full(15, -1 / 15))
+    assert settings.after_episode(state, random_batch(5, 3, 2, 1), TRUNKS[0], key=KEY).scale == state.scale
 
 
 def test_rows_without_mass_cost_nothing_although_they_are_not_finite() -> None:

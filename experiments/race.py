@@ -4,6 +4,8 @@ Every competitor gets the same demonstrations, is evaluated on the same ten star
 time, with imports and compilation and without evaluations. Rows go to `results/race.csv`, with processor time as their seconds;
 what is already there is not run again. `--costs` measures the time of an update and the installed size instead, into
 `results/race-costs.json`. The peers run in `.race`, an environment of their own (`make race`).
+
+Tables and figure are made of the rows alone, so JAX is imported only where something runs.
 """
 
 from __future__ import annotations
@@ -24,10 +26,8 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 
-import pcil
 from pcil.report import figures, stats, tables
 from pcil.report.load import Collection, EvalRow, by_variant, read_rows, sort_key, write_rows
-from pcil.seeds import Stream, episode_seed
 
 ROOT = Path(__file__).parent.parent
 PEERS, ROWS, COSTS = ROOT / "experiments" / "peers", ROOT / "results" / "race.csv", ROOT / "results" / "race-costs.json"
@@ -83,9 +83,12 @@ def one_core() -> dict[str, str]:
 
 def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
     """The rows of one competitor; it prints each as it is measured."""
-    demos = pcil.Demonstrations.load(task)
+    from pcil.demos import Demonstrations
+    from pcil.seeds import Stream, episode_seed
+
+    demos = Demonstrations.load(task)
     with tempfile.TemporaryDirectory() as place:
-        pairs = {f"obs_{i}": episode.obs for i, episode in enumerate(demos.episodes)}
+        pairs: dict[str, Any] = {f"obs_{i}": episode.obs for i, episode in enumerate(demos.episodes)}
         pairs |= {f"action_{i}": episode.action for i, episode in enumerate(demos.episodes)}
         np.savez(Path(place) / "demos.npz", **pairs)
         starts = [episode_seed(seed, Stream.EVALUATE, i) for i in range(10)]
@@ -124,33 +127,34 @@ def commit() -> str:
     return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "src", "experiments") else "")
 
 
-class Shown(pcil.Callback):
-    """Prints each evaluation with the processor time until it began, and stops the run when its time is over."""
-
-    def __init__(self, seconds: float) -> None:
-        self._limit, self._evaluating, self._before = seconds, 0.0, time.process_time()
-
-    def episode(self, row: dict[str, Any]) -> None:
-        self._before = time.process_time()
-
-    def evaluation(self, frames: int, seconds: float, result: Any) -> None:
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-        row = {"seconds": self._before - self._evaluating, "frames": frames, "returns": result.returns.tolist()}
-        print(json.dumps(row | {"memory_mb": memory}), flush=True)
-        self._evaluating += time.process_time() - self._before
-
-    def stop(self) -> bool:
-        return time.process_time() - self._evaluating > self._limit
-
-
 def compete(request: dict[str, Any]) -> int:
     """Train one of our methods until its time is over."""
+    from pcil.training.callbacks import Callback
     from pcil.training.loop import Stopped
+    from pcil.training.runs import train
+
+    class Shown(Callback):
+        """Prints each evaluation with the processor time until it began, and stops the run when its time is over."""
+
+        def __init__(self, seconds: float) -> None:
+            self._limit, self._evaluating, self._before = seconds, 0.0, time.process_time()
+
+        def episode(self, row: dict[str, Any]) -> None:
+            self._before = time.process_time()
+
+        def evaluation(self, frames: int, seconds: float, result: Any) -> None:
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+            row = {"seconds": self._before - self._evaluating, "frames": frames, "returns": result.returns.tolist()}
+            print(json.dumps(row | {"memory_mb": memory}), flush=True)
+            self._evaluating += time.process_time() - self._before
+
+        def stop(self) -> bool:
+            return time.process_time() - self._evaluating > self._limit
 
     method, shown = OURS[request["competitor"]], Shown(60 * request["minutes"])
     settings = {"seed": request["seed"], "frames": 10_000_000, "evaluate_every": 5000, "checkpoint_seconds": 1e9}
     with contextlib.suppress(Stopped):
-        pcil.train(request["task"], method=method, out=request["out"], callbacks=[shown], **settings)
+        train(request["task"], method=method, out=request["out"], callbacks=[shown], **settings)
     return 0
 
 

@@ -12,12 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from collect import finished, settings, variant
-
-from pcil.demos import Demonstrations
-from pcil.policy import load_policy
 from pcil.report import tables
-from pcil.training.evaluate import environments_for, evaluate
 
 ROWS = Path(__file__).parent.parent / "results" / "starts.json"
 STARTS, SEED = 100, 1000
@@ -26,6 +21,8 @@ NAME = ("task", "method", "variant", "seed", "frames")
 
 def main(*folders: str) -> None:
     """Evaluate what is new."""
+    from collect import finished, settings, variant  # with JAX, which the table does without
+
     rows = {tuple(row[name] for name in NAME): row for row in (json.loads(ROWS.read_text()) if ROWS.exists() else [])}
     for folder in finished(folders):
         run = settings(folder)
@@ -41,6 +38,10 @@ def main(*folders: str) -> None:
 
 def returns(folder: Path, task: str) -> dict[str, Any]:
     """Mean and least return, and the number of starts that fail: that return less than half of the demonstrations' mean."""
+    from pcil.demos import Demonstrations
+    from pcil.policy import load_policy
+    from pcil.training.evaluate import environments_for, evaluate
+
     expert = Demonstrations.load(task).return_mean
     assert expert is not None
     with environments_for(task, STARTS) as (_, made):

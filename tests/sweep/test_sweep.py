@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -24,7 +25,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from test_loop import StopAfter, finish, same_run
 
-from pcil import cli, sweep
+from pcil import cli, envs, sweep
 from pcil.envs import TASKS
 from pcil.errors import InputError
 from pcil.rewards import REWARDS
@@ -681,3 +682,24 @@ def test_the_smoke_sweep_runs_from_end_to_end(session: Session) -> None:
     jobs = plans.read(ROOT / "experiments" / "smoke.toml", Path("smoke")).jobs
     assert [job.name for job in jobs] == [f"pendulum_swingup/{method}/{seed}" for method in ("pcil", "dac") for seed in (1, 2)]
     assert all(job.state == "done" and job.frames == 16_000 and f"done    {job.name}: return" in printed for job in jobs)
+
+
+def test_runs_of_one_task_are_checked_in_one_environment_and_one_is_open_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, counted = envs.opened, []
+
+    @contextlib.contextmanager
+    def opened(task: Any, *arguments: Any, **named: Any) -> Any:
+        if isinstance(task, str):
+            counted.append(f"+{task}")
+        with real(task, *arguments, **named) as environment:
+            yield environment
+        if isinstance(task, str):
+            counted.append(f"-{task}")
+
+    monkeypatch.setattr(envs, "opened", opened)
+    table = {"tasks": ["pendulum_swingup", "finger_spin"], "methods": ["pcil"], "seeds": [1, 2, 3], "frames": 3000}
+    plan = plans.of_table("the command", table, tmp_path, None)
+    assert [job.run.seed for job in plan.jobs] == 2 * [1, 2, 3]
+    assert counted == ["+pendulum_swingup", "-pendulum_swingup", "+finger_spin", "-finger_spin"]

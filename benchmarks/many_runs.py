@@ -56,7 +56,8 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--jobs", type=int, default=64)
     given = parser.parse_args()
-    seeds = list(range(-(-given.runs // 20)))
+    arms = len(TASKS) * len(METHODS)
+    seeds = list(range(-(-given.runs // arms)))
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
         (root / "sweep.toml").write_text(FILE.format(tasks=json.dumps(TASKS), methods=json.dumps(METHODS), seeds=seeds))
@@ -67,7 +68,7 @@ def main() -> int:
         alone = one_process(root)
         command = [sys.executable, "-c", SWEEP, str(root / "run.py"), "sweep", str(root / "sweep.toml")]
         command += ["--out", str(root / "runs"), "--jobs", str(given.jobs)]
-        total, began = 20 * len(seeds), time.perf_counter()
+        total, began = arms * len(seeds), time.perf_counter()
         with (root / "first.log").open("w") as log, subprocess.Popen(command, stdout=log) as first:
             planned = None
             while (ended := done(root)) < total // 2 and first.poll() is None:

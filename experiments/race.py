@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from matplotlib import pyplot as plt
 
+from pcil.bench import SINGLE_THREAD
 from pcil.report import figures, stats, tables
 from pcil.report.load import Collection, EvalRow, by_variant, read_rows, sort_key, write_rows
 
@@ -77,7 +78,7 @@ def python(script: str) -> list[str]:
 def one_core() -> dict[str, str]:
     """The environment variables of a process that is to use one core; `.race` finds the package's environment in src."""
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    flags = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"}
+    flags = {"XLA_FLAGS": SINGLE_THREAD}
     return {**os.environ, **one, **flags, "PYTHONPATH": str(ROOT / "src"), "MUJOCO_GL": "disabled", "CUDA_VISIBLE_DEVICES": ""}
 
 
@@ -95,7 +96,7 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
         request = {"competitor": name, "task": task, "seed": seed, "minutes": minutes, "starts": starts}
         request |= {"demos": f"{place}/demos.npz", "out": f"{place}/run"}
         errors, pipe = Path(place) / "errors.txt", subprocess.PIPE
-        command = python(COMPETITORS[name])
+        command, source = python(COMPETITORS[name]), commit()
         with (
             errors.open("w") as said,
             subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said, text=True, env=one_core(), cwd=place) as child,
@@ -111,7 +112,7 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
                 returns, memory = got["returns"], got["memory_mb"]
                 seen = got["frames"], statistics.fmean(returns), min(returns), max(returns), demos.return_mean
                 variant = SETTINGS.get(name, "default")
-                rows.append(EvalRow(task, name, variant, seed, *seen, commit(), round(got["seconds"], 1)))
+                rows.append(EvalRow(task, name, variant, seed, *seen, source, round(got["seconds"], 1)))
                 print(
                     f"{name:15} {task:12} {got['seconds'] / 60:6.2f} min {got['frames']:9,} frames  {rows[-1].return_mean:7.1f}"
                 )

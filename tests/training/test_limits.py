@@ -27,38 +27,26 @@ LIMITS: dict[Any, dict[str, tuple[float, float]]] = {
     BC(): {"learning_rate": (0, 1), "deviation": (1e-6, inf), "feature_dim": (1, inf), "hidden": (1, inf)},
     PCIL(): {
         **dict.fromkeys(["penalty", "stages", "stage_weight"], (0, inf)),
-        **{
-            "subsampling": (1, inf),
-            "temperature": (1e-6, inf),
-            "penalty_every": (1, inf),
-            "hidden": (4, inf),
-            "batch_size": (2, inf),
-        },
+        **{"temperature": (1e-6, inf), "penalty_every": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
         "learning_rate": (0, 1),
     },
     PCIL(penalty_rows=3): {"penalty_rows": (1, PCIL().batch_size)},
-    TCN(): {
-        "subsampling": (1, inf),
-        "temperature": (1e-6, inf),
-        "window": (1, inf),
-        "margin": (1, inf),
-        "hidden": (4, inf),
-        "batch_size": (2, inf),
-    },
+    TCN(): {"temperature": (1e-6, inf), "window": (1, inf), "margin": (1, inf), "hidden": (4, inf), "batch_size": (2, inf)},
     TCN(negatives="rollout", window=3): {"margin": (4, inf), "learning_rate": (0, 1)},
-    DAC(): {"subsampling": (1, inf), "batch_size": (1, inf), "penalty": (0, inf), "hidden": (1, inf), "learning_rate": (0, 1)},
+    DAC(): {"batch_size": (1, inf), "penalty": (0, inf), "hidden": (1, inf), "learning_rate": (0, 1)},
     PWIL(): {
-        **{"alpha": (1e-6, inf), "beta": (0, inf), "subsampling": (1, inf), "refresh": (1, inf)},
+        **{"alpha": (1e-6, inf), "beta": (0, inf), "refresh": (1, inf)},
         **{"prefill_steps": (0, inf), "batch_size": (0, inf), "task_weight": (-inf, inf)},
     },
     SIL(): {
-        **dict.fromkeys(["subsampling", "iterations", "batch_size", "hidden", "embedding", "every"], (1, inf)),
+        **dict.fromkeys(["iterations", "batch_size", "hidden", "embedding", "every"], (1, inf)),
         **{"epsilon": (3e-3, inf), "first_sum": (-inf, 0), "learning_rate": (0, 1)},
     },
-    POTIL(): {"subsampling": (1, inf), "refresh": (1, inf), "epsilon": (3e-3, inf)},
+    POTIL(): {"refresh": (1, inf), "epsilon": (3e-3, inf)},
 }
 """The smallest and largest value of every number with limits, by hand."""
 CASES = [(settings, name, *limits) for settings, numbers in LIMITS.items() for name, limits in numbers.items()]
+CASES += [(kind(), "subsampling", 1, inf) for kind in (PCIL, TCN, DAC, PWIL, SIL, POTIL)]
 
 
 @pytest.mark.parametrize(("settings", "name", "low", "high"), CASES, ids=lambda value: value if isinstance(value, str) else "")

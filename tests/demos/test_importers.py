@@ -154,6 +154,20 @@ def test_what_was_found_and_left_out_is_said(tmp_path: Path) -> None:
     assert "Left out: the columns note." in told and "Time step: 0.05 s." in told
 
 
+@pytest.mark.parametrize("version", ["2.1", "3.0"])
+def test_files_of_lerobots_own_writer_are_read(version: str) -> None:
+    """Both files were written by experiments/peers/lerobot_files.py, whose numbers follow from episode and time."""
+    found = importers.load([Path(__file__).parent / "lerobot" / version])
+    for number, (got, steps) in enumerate(zip(found.demos.episodes, (5, 4), strict=True)):
+        times = np.arange(steps)
+        assert np.array_equal(got.obs, np.stack([np.full(steps, number), times, times / 2], axis=1))
+        assert np.allclose(got.action, np.stack([times, -times], axis=1)[:-1] / 10, atol=1e-7)
+        assert np.array_equal(got.reward, times[:-1]) and not got.terminated
+    told = "\n".join(found.told)
+    assert f"Read 2 episodes, 7 steps, from LeRobot {version}." in told and "Time step: 0.05 s." in told
+    assert "Left out: observation.environment_state, which no key names." in told and "timestamp" not in told
+
+
 def test_actions_get_their_bounds(tmp_path: Path) -> None:
     """At bounds of -2 and 6, the action 4 is 0.5."""
     np.savez(tmp_path / "one.npz", obs=np.zeros((3, 1)), action=np.array([[4.0], [-2.0]]))

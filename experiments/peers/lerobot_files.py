@@ -1,7 +1,7 @@
 """Write the dataset that tests/demos/test_importers.py reads by LeRobot's own writer: python lerobot_files.py FOLDER
 
-Run it in an environment of its own: lerobot 0.4.4 writes version 3, lerobot 0.3.3 (with numpy below 2.3) version 2.1. Of what it
-writes, tests/demos/lerobot/ has meta/info.json and data/, which are all that is read.
+Run it in an environment of its own: lerobot 0.4.4 writes version 3, lerobot 0.3.3 (with numpy below 2.3) version 2.1.
+Of what it writes, tests/demos/lerobot/ has meta/info.json and data/, which are all that is read.
 """
 
 from __future__ import annotations

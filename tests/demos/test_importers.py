@@ -151,7 +151,24 @@ def test_what_was_found_and_left_out_is_said(tmp_path: Path) -> None:
     told = "\n".join(importers.load([write_robomimic(tmp_path / "b", episodes)]).told)
     assert "Observations: a_position, b_speed." in told and "obs/camera_image, which is no rows of numbers" in told
     told = "\n".join(importers.load([write_csv(tmp_path / "c", episodes)]).told)
-    assert "Left out: the columns note." in told and "Time step: 0.05 s." in told
+    assert "Left out: note, which no key names." in told and "Time step: 0.05 s." in told
+
+
+@pytest.mark.parametrize("format_", ["npz", "csv", "d4rl", "robomimic"])
+def test_columns_that_nothing_uses_are_named_and_counters_are_not(tmp_path: Path, format_: str) -> None:
+    columns = {"obs": np.zeros(4), "torque": np.zeros(4), "actions": np.zeros(4), "index": np.arange(4), "t": np.arange(4)}
+    source = tmp_path / f"one.{format_}"
+    if format_ == "npz":
+        np.savez(source, **columns)
+    elif format_ == "csv":
+        source.write_text("\n".join([",".join(columns), *("0,0,0,0,0" for _ in range(4))]) + "\n")
+    else:
+        columns = {"obs/obs" if format_ == "robomimic" and name == "obs" else name: rows for name, rows in columns.items()}
+        with h5py.File(source, "w") as file:
+            for name, rows in columns.items():
+                file[f"data/demo_0/{name}" if format_ == "robomimic" else name] = rows
+    left = [line for line in importers.load([source]).told if "no key" in line]
+    assert left == ["Left out: torque, which no key names."]
 
 
 @pytest.mark.parametrize("version", ["2.1", "3.0"])

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pcil import files
-from pcil.demos.importers.tables import TIME, Keys, Source, chosen, grouped, split, step_seconds
+from pcil.demos.importers.tables import TIME, Keys, Source, chosen, grouped, split, step_seconds, unnamed
 from pcil.errors import InputError
 
 LARGEST = 2**31
@@ -40,7 +40,7 @@ def read_npz(path: Path, keys: Keys) -> Source:
             else:
                 found[name] = array
     used, names = chosen(found, keys, str(path))
-    return Source("NumPy", split(used, str(path)), names, dropped, step_seconds=_time(found))
+    return Source("NumPy", split(used, str(path)), names, dropped + unnamed(found, names), step_seconds=_time(found))
 
 
 def is_csv(path: Path) -> bool:
@@ -79,11 +79,11 @@ def read_csv(path: Path, keys: Keys) -> Source:
             row = int(np.argmin(np.isfinite(used[meaning]).all(axis=-1)))
             raise InputError(f"Line {row + 2} of {path} has no number in the columns {', '.join(chosen_names)}.")
     taken = {i for chosen_names in names.values() for name in chosen_names for i in columns[name]}
-    left = [header[i] for i in numbers if i not in taken]
+    left = unnamed([header[i] for i in range(len(header)) if i not in taken], {})
     time = next((rows[:, i] for i, name in enumerate(header) if name in TIME), None)
     tables = split(used, str(path))
     seconds = None if time is None else step_seconds(time[: len(tables[0].obs)])
-    return Source("CSV", tables, names, [f"the columns {', '.join(left)}"] if left else [], step_seconds=seconds)
+    return Source("CSV", tables, names, left, step_seconds=seconds)
 
 
 def _time(found: dict[str, np.ndarray]) -> float | None:

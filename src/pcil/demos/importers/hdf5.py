@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pcil.demos.hdf5 import Damage, read
-from pcil.demos.importers.tables import Keys, Source, Table, chosen, split
+from pcil.demos.importers.tables import Keys, Source, Table, chosen, split, unnamed
 from pcil.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -35,12 +35,13 @@ def read_hdf5(path: Path, keys: Keys) -> Source:
     shown = [f"{name}, which is no rows of numbers" for name in dropped]
     plain = {name: array for name, array in found.items() if "/" not in name} or found
     used, names = chosen(plain, keys, str(path))
-    return Source("HDF5 of flat arrays (D4RL)", split(used, str(path)), names, shown)
+    return Source("HDF5 of flat arrays (D4RL)", split(used, str(path)), names, shown + unnamed(found, names))
 
 
 def _robomimic(path: Path, found: dict[str, np.ndarray], dropped: list[str], episodes: list[str], keys: Keys) -> Source:
     """All low-dimensional observations of `obs/` side by side in alphabetical order, unless some are named."""
-    tables, names = list[Table](), dict[str, list[str]]()
+    tables, left = list[Table](), dict[str, None]()
+    names = dict[str, list[str]]()
     prefix = f"data/{episodes[0]}/obs/"
     usual = sorted(name.removeprefix(prefix) for name in found if name.startswith(prefix))
     wanted = list(keys.obs) or usual
@@ -51,6 +52,7 @@ def _robomimic(path: Path, found: dict[str, np.ndarray], dropped: list[str], epi
         after = {name.removeprefix("next_obs/"): array for name, array in own.items() if name.startswith("next_obs/")}
         inner = Keys(wanted, keys.action, keys.reward)
         used, names = chosen({name: array for name, array in own.items() if "/" not in name} | before, inner, where)
+        left |= dict.fromkeys(name.removeprefix("obs/") for name in own if not name.startswith("next_obs/"))
         if set(wanted) <= after.keys():
             used["next_obs"] = chosen(after, Keys(wanted), where)[0]["obs"]
         done = used.pop("terminated", np.zeros(1)).reshape(-1)
@@ -58,7 +60,7 @@ def _robomimic(path: Path, found: dict[str, np.ndarray], dropped: list[str], epi
         tables.append(table._replace(terminated=bool(done[-1])))
     shared = sorted({name.split("/", 2)[2] for name in dropped if name.startswith("data/demo_")})
     shown = [f"{name}, which is no rows of numbers" for name in shared]
-    return Source("robomimic", tables, names, shown)
+    return Source("robomimic", tables, names, shown + unnamed(left, names))
 
 
 def _number(name: str) -> int:

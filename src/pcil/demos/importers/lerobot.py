@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 
 from pcil import files
-from pcil.demos.importers.tables import Keys, Source, chosen, split
+from pcil.demos.importers.tables import Keys, Source, chosen, split, unnamed
 from pcil.errors import InputError
 
 ROWS = 2**26
 """The largest number of rows of a dataset."""
-
-COUNTERS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""What LeRobot adds to each row; only the numbers of frame and episode are needed."""
 
 
 def is_lerobot(path: Path) -> bool:
@@ -52,7 +49,6 @@ def read_lerobot(path: Path, keys: Keys) -> Source:
     used, names = chosen(found, keys, str(path))
     task = str(info.get("robot_type") or path.name)
     shown = [f"{name}, which is {features[name]['dtype']}" for name in images]
-    taken = {name for columns in names.values() for name in columns}
-    shown += [f"{name}, which no key names" for name in found if name not in taken and name not in COUNTERS]
+    shown += unnamed(found, names)
     version = str(info.get("codebase_version", "")).removeprefix("v")
     return Source(f"LeRobot {version}".strip(), split(used, str(path)), names, shown, step_seconds=seconds, task=task)

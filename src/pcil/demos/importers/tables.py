@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -23,6 +23,8 @@ NAMES: dict[str, tuple[str, ...]] = {
 }
 """What columns are called, the most usual name first."""
 TIME = ("time", "t", "timestamp", "seconds")
+COUNTERS = (*TIME, "step", "index", "frame_index", "episode_index", "task_index")
+"""Columns that number or time the rows; when nothing uses them, that is not worth a line."""
 
 
 @dataclass
@@ -91,6 +93,13 @@ def chosen(found: Mapping[str, np.ndarray], keys: Keys, where: str) -> tuple[dic
             f"{', '.join(NAMES['obs'][:3])}; name them by --obs-keys."
         )
     return used, names
+
+
+def unnamed(found: Iterable[str], names: Mapping[str, Sequence[str]]) -> list[str]:
+    """What of `found` no column of `names` took, apart from `COUNTERS`, as one entry of `Source.dropped`, or none."""
+    taken = {name for columns in names.values() for name in columns}
+    left = [name for name in found if name not in taken and name not in COUNTERS]
+    return [f"{', '.join(left)}, which no key names"] if left else []
 
 
 def split(used: Mapping[str, np.ndarray], where: str) -> list[Table]:

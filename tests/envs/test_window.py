@@ -31,21 +31,25 @@ class Shown(gymnasium.Env):
     action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
     seen: list[Any] = []  # noqa: RUF012  by all of them
 
-    def __init__(self, render_mode: str | None = None, fails: bool = False) -> None:
-        self.render_mode, self.fails = render_mode, fails
+    def __init__(self, render_mode: str | None = None, fails_at: int | None = None) -> None:
+        self.render_mode, self.fails_at = render_mode, fails_at
         self.seen.append(render_mode)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        if self.fails:
-            raise RuntimeError("No available video device")
         super().reset(seed=seed)
         self.time = 0
+        self.draw()
         self.seen.append(seed)
         return np.zeros(3, np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.time += 1
+        self.draw()
         return np.zeros(3, np.float32), 2.0, False, self.time == 3, {}
+
+    def draw(self) -> None:
+        if self.time == self.fails_at:
+            raise RuntimeError("No available video device")
 
     def close(self) -> None:
         self.seen.append("closed")
@@ -70,9 +74,17 @@ def test_an_environment_shows_itself(shown: str, capsys: pytest.CaptureFixture[s
 
 @pytest.mark.usefixtures("shown")
 def test_a_window_that_the_environment_can_not_open_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["play", "run", "--env-kwargs", '{"fails": true}']) == 1
+    assert cli.main(["play", "run", "--env-kwargs", '{"fails_at": 0}']) == 2
     out, err = capsys.readouterr()
-    assert out == "" and "raised RuntimeError (No available video device)" in err and err.count("\n") == 1
+    assert out == "" and "No window can be opened: " in err and "pcil film makes a film" in err
+    assert "raised RuntimeError (No available video device)" in err and err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("shown")
+def test_an_environment_that_fails_in_its_window_has_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["play", "run", "--env-kwargs", '{"fails_at": 2}']) == 1
+    err = capsys.readouterr().err
+    assert "raised RuntimeError (No available video device)" in err and "No window" not in err and err.count("\n") == 1
 
 
 NO_DISPLAY = ("DISPLAY", "WAYLAND_DISPLAY")

@@ -11,7 +11,7 @@ from typing import Any
 
 from pcil import envs
 from pcil.envs.dmc import DMCEnv, has_display
-from pcil.errors import InputError
+from pcil.errors import InputError, RunError
 
 Refresh = Callable[[], bool]
 """Shows the current state; to be called after each reset and step. False once the user has closed the window."""
@@ -28,9 +28,19 @@ def opened(task: str, env_kwargs: dict[str, Any]) -> Iterator[tuple[envs.Checked
     if not envs.gymnasium_id(task).startswith("dmc/"):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*HumanRendering wrapper")  # Gymnasium shows the pictures of other environments
-            context = envs.opened(task, render_mode="human", env_kwargs=env_kwargs)
-            with context as env:
-                yield env, lambda: True  # it draws itself in `step`
+            begun = threading.Event()
+
+            def refresh() -> bool:
+                begun.set()
+                return True  # it draws itself in `reset` and `step`
+
+            try:
+                with envs.opened(task, render_mode="human", env_kwargs=env_kwargs) as env:
+                    yield env, refresh
+            except RunError as error:
+                if begun.is_set():
+                    raise
+                raise InputError(_instead(str(error))) from error
         return
     with envs.opened(task, env_kwargs=env_kwargs) as env:
         viewer = _Viewer(env.unwrapped)

@@ -14,7 +14,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml uv.lock
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --extra sweep --extra onnx --extra film --extra lerobot --extra wandb --extra mlflow --inexact --quiet
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --extra sweep --extra onnx --extra film --extra mujoco --extra lerobot --extra wandb --extra mlflow --inexact --quiet
 	touch $(STAMP)
 
 train: $(STAMP)
@@ -56,7 +56,7 @@ archive: $(STAMP)
 	$(BIN)/python experiments/archive.py
 
 docs: $(STAMP)
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs --extra report --extra sweep --extra onnx --extra film --extra lerobot --extra wandb --extra mlflow --inexact --quiet
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs --extra report --extra sweep --extra onnx --extra film --extra mujoco --extra lerobot --extra wandb --extra mlflow --inexact --quiet
 	$(BIN)/mkdocs build
 
 format: $(STAMP)

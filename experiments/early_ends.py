@@ -1,7 +1,7 @@
 """Imitation in tasks that may end early, with and without absorbing states: one with a goal, and one with a fall.
 
 Run python experiments/early_ends.py; interrupted runs resume, and finished ones are skipped.
-InvertedPendulum-v5 needs `pip install imageio`.
+InvertedPendulum-v5 needs `pip install '.[mujoco]'`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Train, select and record the experts of experts.toml; repeated, it resumes: python experiments/experts.py [TASK ...]
 
 With --record before the tasks nothing is trained: the included policies are recorded again. Included demonstrations that still
-satisfy the rule of experts.toml keep their episodes; only their metadata are updated.
+satisfy the rule of experts.toml keep their episodes; only their metadata are updated. What is not included in the package
+(`include = false`) is written below runs/experts/demos.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def main(wanted: list[str]) -> None:
         if task not in plan:
             raise InputError(f"experts.toml has no {task}; it has {', '.join(plan)}.")
         settings = dict(plan[task])
-        how = {name: settings.pop(name) for name in ("wanted", "tries")}
+        how = {name: settings.pop(name) for name in ("wanted", "tries")} | {"include": settings.pop("include", True)}
         how |= {"seed": settings.pop("record_seed", 0), "minimum_return": settings.pop("minimum_return", MINIMUM_RETURN)}
         if again:
             record_again(task, how["seed"], how["minimum_return"])
@@ -67,11 +68,19 @@ def record(task: str, policy: Policy, seed: int, minimum_return: float, info: di
     return demos.record(policy, env, EPISODES, task=task, seed=seed, minimum_return=minimum_return, info=info)
 
 
-def place(task: str, recorded: demos.Demonstrations) -> Path:
-    """Save the recorded dataset beside the included one, before replacing it."""
-    target = demos.SHIPPED / "dmc" / task / "expert-v0"
-    shutil.rmtree(target.with_name("fresh"), ignore_errors=True)
-    return recorded.save(target.with_name("fresh"), dataset_id=f"dmc/{task}/expert-v0")
+def place(task: str, recorded: demos.Demonstrations, root: Path = demos.SHIPPED) -> None:
+    """Save the recorded dataset below a Minari root. If it has the episodes that are there, only their metadata change."""
+    suite = "dmc" if envs.gymnasium_id(task).startswith("dmc/") else "gymnasium"
+    name = f"{suite}/{task}/expert-v0"
+    target, fresh = root / name, root / suite / task / "fresh"
+    shutil.rmtree(fresh, ignore_errors=True)
+    recorded.save(fresh, dataset_id=name)
+    if target.exists() and demos.Demonstrations.load(target).hash == recorded.hash:
+        shutil.copy(fresh / "data" / "metadata.json", target / "data" / "metadata.json")
+        shutil.rmtree(fresh)
+    else:
+        shutil.rmtree(target, ignore_errors=True)
+        fresh.rename(target)
 
 
 def record_again(task: str, seed: int, minimum_return: float) -> None:
@@ -81,35 +90,32 @@ def record_again(task: str, seed: int, minimum_return: float) -> None:
     info["record_command"] = f"python experiments/experts.py --record {task}"
     recorded = record(task, load_policy(POLICIES / task), seed, minimum_return, info)
     said = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}, least {recorded.returns.min():.1f}"
-    target = demos.SHIPPED / "dmc" / task / "expert-v0"
     if recorded.hash == shipped.hash:
-        fresh = place(task, recorded)
-        shutil.copy(fresh / "data" / "metadata.json", target / "data" / "metadata.json")
-        shutil.rmtree(fresh)
+        place(task, recorded)
         print(f"{task}: {said}, the same arrays as the included ones")
     elif shipped.returns.min() >= minimum_return:
         print(f"{task}: {said}, not the included arrays, which satisfy the rule ({shipped.returns.min():.1f}) and are kept")
     else:
-        fresh = place(task, recorded)
-        shutil.rmtree(target)
-        fresh.rename(target)
+        place(task, recorded)
         print(f"{task}: {said}, replacing the old ones ({shipped.return_mean:.1f}, least {shipped.returns.min():.1f})")
 
 
-def ship(task: str, *, folder: Path, wanted: float, tries: int, seed: int, minimum_return: float) -> None:
-    """Put ten deterministic episodes and the policy into the package, replacing the old ones, and the curve into results."""
+def ship(task: str, *, folder: Path, wanted: float, tries: int, include: bool, seed: int, minimum_return: float) -> None:
+    """Put ten deterministic episodes and the policy into the package, replacing the old ones, and the curve into results.
+
+    Without `include`, the episodes are written below `RUNS` instead, and the policy stays in its run.
+    """
     policy = load_policy(folder)
     command = f"python experiments/experts.py {task}"
     info = runs.provenance(folder, policy, command) | {"seeds_tried": tries}
     recorded = record(task, policy, seed, minimum_return, info)
     if recorded.returns.mean() < wanted:
         recorded.info["expert"] += f"; below the wanted {wanted}"
-    fresh, target = place(task, recorded), demos.SHIPPED / "dmc" / task / "expert-v0"
-    shutil.rmtree(target, ignore_errors=True)
-    fresh.rename(target)
-    info = policy.info | info
-    dataclasses.replace(policy, info=info).save(POLICIES / task)
-    (POLICIES / task / "README.md").write_text(card(task, info, "mit", task))
+    place(task, recorded, demos.SHIPPED if include else RUNS / "demos")
+    if include:
+        info = policy.info | info
+        dataclasses.replace(policy, info=info).save(POLICIES / task)
+        (POLICIES / task / "README.md").write_text(card(task, info, "mit", task))
     write_rows(RESULTS / f"{task}.csv", read_run(folder))
     print(f"{task}: {recorded.return_mean:.1f} +- {recorded.return_std:.1f} from {folder}")
 

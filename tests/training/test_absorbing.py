@@ -9,9 +9,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from pcil.demos import Demonstrations
 from pcil.envs.toy import Reach
 from pcil.errors import InputError
 from pcil.policy import Policy
-from pcil.rewards import Reward
+from pcil.rewards import TaskReward
 from pcil.training import fit, loop, presets, runs, state
 from pcil.training.callbacks import Callback
 from pcil.training.config import changed
@@ -50,23 +49,6 @@ class Exit(gymnasium.Env):
         return np.zeros(1, np.float32), 0.0, bool(action[0] > 0), False, {}
 
 
-@dataclass(frozen=True)
-class Constant(Reward):
-    """Every step has the same reward, so the reward favours neither an early end nor survival."""
-
-    needs_demos: ClassVar[bool] = False
-    batch_size: int = 0
-    pay: float = 1.0
-
-    def init(self, demos: Any, embed: Any, *, key: Any) -> None: ...
-
-    def update(self, state: Any, expert: Any, agent: Any, embed: Any, *, key: Any) -> Any:
-        return state, {}
-
-    def reward(self, state: Any, batch: Any, embed: Any, *, key: Any) -> Any:
-        return jnp.full(batch.obs.shape[0], self.pay)
-
-
 @pytest.fixture(autouse=True)
 def _registered() -> Any:
     gymnasium.register(EXIT, Exit, max_episode_steps=20)
@@ -78,7 +60,7 @@ def trained(pay: float, absorbing: bool, folder: Path, n_step: int = 1) -> state
     """Train on uniform actions only, so that both kinds of action occur regardless of the agent's policy."""
     agent = narrow(DrQV2(), learning_rate=3e-3, hidden=32, tau=0.05, gamma=GAMMA, n_step=n_step, absorbing=absorbing)
     changes = {"frames": 1500, "random_frames": 1500, "evaluate_every": 1500, "update_every": 1, "agent": agent}
-    run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=Constant(pay=pay))
+    run = dataclasses.replace(small_run("expert", EXIT, **changes), reward=TaskReward(task_weight=0.0, constant=pay))
     folder.mkdir()
     return loop.train_loop(run, folder, ())
 

@@ -266,8 +266,13 @@ def _in_unit_box(episode: Episode, space: gymnasium.Space) -> Episode:
 
 
 def shipped_tasks() -> list[str]:
-    """The names of the tasks whose demonstrations ship with the package."""
-    return sorted(path.parents[2].name for path in SHIPPED.glob("dmc/*/expert-v0/data/metadata.json"))
+    """The names of the tasks whose demonstrations ship with the package, those of DeepMind Control first."""
+    return list(_shipped_places())
+
+
+def _shipped_places() -> dict[str, Path]:
+    """The dataset of each such task, `<suite>/<task>/expert-v0`."""
+    return {path.parents[2].name: path.parents[1] for path in sorted(SHIPPED.glob("*/*/expert-v0/data/metadata.json"))}
 
 
 def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, bounded: bool = True) -> None:
@@ -304,9 +309,9 @@ def _check(demos: Demonstrations, source: str, spec: Spec | None = None, *, boun
 
 def _find(spec: str | Path) -> Path:
     """The folder that holds `metadata.json` of the dataset that `spec` names."""
-    names = shipped_tasks()
-    if isinstance(spec, str) and task_of(spec) in names:
-        places = [SHIPPED / "dmc" / task_of(spec) / "expert-v0"]
+    shipped = _shipped_places()
+    if isinstance(spec, str) and task_of(spec) in shipped:
+        places = [shipped[task_of(spec)]]
     else:
         places = [_expanded(Path(spec)), _minari_root() / spec]
     for place in places:
@@ -315,7 +320,7 @@ def _find(spec: str | Path) -> Path:
                 return data
     raise InputError(
         f"There is no Minari dataset (a folder with data/metadata.json) {str(spec)!r}: give a shipped task "
-        f"({', '.join(names) or 'none ship'}), the path of such a folder, or an id below {_minari_root()}."
+        f"({', '.join(shipped) or 'none ship'}), the path of such a folder, or an id below {_minari_root()}."
     )
 
 

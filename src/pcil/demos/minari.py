@@ -186,8 +186,9 @@ def _env_spec(task: str, origin: Origin) -> EnvSpec | None:
 
 
 def task_of(name: str) -> str:
-    """The task in "dmc/<task>-v0" (an environment) or "dmc/<task>/expert-v0" (a dataset); other names are unchanged."""
-    return re.sub(r"\Admc/(\w+?)(/expert)?-v0\Z", r"\1", name)
+    """The task in the id of a dataset, "dmc/<task>/expert-v0" or "gymnasium/<id>/expert-v0", or of an environment,
+    "dmc/<task>-v0"; other names are unchanged."""
+    return re.sub(r"\A(?:dmc/(\w+?)(?:/expert)?|gymnasium/([\w-]+)/expert)-v0\Z", r"\1\2", name)
 
 
 def reason(error: Exception) -> str:

@@ -171,6 +171,45 @@ def test_columns_that_nothing_uses_are_named_and_counters_are_not(tmp_path: Path
     assert left == ["Left out: torque, which no key names."]
 
 
+SPELLINGS: dict[str, Callable[[str], str | bytes]] = {
+    "byte order mark": lambda text: text.encode("utf-8-sig"),
+    "UTF-16": lambda text: text.encode("utf-16"),
+    "Windows": lambda text: text.replace("\n", "\r\n"),
+    "semicolons, decimal commas": lambda text: text.replace(",", ";").replace(".", ","),
+    "tabs": lambda text: text.replace(",", "\t"),
+    "spaces": lambda text: text.replace(",", "  "),
+    "quotes": lambda text: "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()),
+    "empty lines": lambda text: "\n" + text.replace("\n", "\n\n") + "\n\n",
+    "a comma at the end": lambda text: text.replace("\n", ",\n"),
+    "an index without a name": lambda text: "".join(
+        f"{i - 1 if i else ''},{line}\n" for i, line in enumerate(text.splitlines())
+    ),
+    "capitals": lambda text: text.replace("obs", "Obs").replace("action", "ACTION").replace("done", "Done"),
+    "words": lambda text: text.replace(",0\n", ",False\n").replace(",1\n", ",True\n"),
+    "a comment above": lambda text: "# of the arm\n#\n" + text,
+    "NumPy": lambda text: "# " + text,
+    "NumPy, no commas": lambda text: "# of the arm\n# " + text.replace(",", " "),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_a_csv_file_is_the_same_however_it_is_spelled(spelling: str, tmp_path: Path) -> None:
+    """Two episodes of three and two rows; the last action of each is left out, since no state follows it."""
+    obs = [[0.5, -1.25], [1e-3, 2.0], [3.5, 4.0], [7.0, 8.5], [9.0, -0.5]]
+    lines = [f"{a},{b},{a / 10},{int(i == 2)}" for i, (a, b) in enumerate(obs)]
+    text = SPELLINGS[spelling]("\n".join(["obs_0,obs_1,action,done", *lines]) + "\n")
+    (tmp_path / "a.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+    found = importers.load([tmp_path / "a.csv"])
+    assert [e.obs.tolist() for e in found.demos.episodes] == [np.float32(obs[:3]).tolist(), np.float32(obs[3:]).tolist()]
+    assert np.array_equal(found.demos.action[:, 0], np.float32([0.05, 1e-4, 0.7])) and "no key" not in "".join(found.told)
+
+
+def test_thousands_are_no_decimal_commas(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('obs_0,obs_1\n1,2\n"1,234",2\n')
+    with pytest.raises(InputError, match=r"Line 3 of .* has no number in the columns obs"):
+        importers.load([tmp_path / "a.csv"])
+
+
 @pytest.mark.parametrize("version", ["2.1", "3.0"])
 def test_files_of_lerobots_own_writer_are_read(version: str) -> None:
     """Both files were written by experiments/peers/lerobot_files.py, whose numbers follow from episode and time."""
@@ -258,6 +297,9 @@ def bad(name: str, place: Path) -> list[str]:
     elif name == "ragged":
         file = place / "a.csv"
         file.write_text("obs_0,obs_1\n1,2\n3\n")
+    elif name == "no rows":
+        file = place / "a.csv"
+        file.write_text("obs_0,action_0\n")
     elif name == "hole":
         file = place / "a.csv"
         file.write_text("obs_0,action_0\n1,0\n,0\n3,0\n")
@@ -289,8 +331,9 @@ def bad(name: str, place: Path) -> list[str]:
         ("nothing", "There is no file or folder"),
         ("text", "is nothing that can be imported"),
         ("header", "must have a different name for each column"),
-        ("ragged", "rows of different lengths"),
+        ("ragged", "rows of different lengths: line 3 has 1, and the header 2"),
         ("hole", "Line 3 of"),
+        ("no rows", "has no rows below its header of 2 columns"),
         ("no observations", "has no observations: none of its columns (numbers)"),
         ("lengths", "has 9 observations"),
         ("one row", "There is no episode of at least one step"),

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
-import warnings
+import io
+import math
 import zipfile
+from array import array
 from pathlib import Path
 
 import numpy as np
@@ -51,39 +54,79 @@ def read_csv(path: Path, keys: Keys) -> Source:
     """The episodes of a CSV file with a header; numbered columns such as `obs_0` and `obs_1` are one array `obs`."""
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has {path.stat().st_size:,} bytes, and at most {LARGEST:,} are read.")
-    with files.open_regular(path) as file:
-        head = file.readline(2**20).decode(errors="replace")
-    separator = max(",;\t", key=head.count)
-    header = [name.strip() for name in next(csv.reader([head], delimiter=separator), [])]
-    if len(set(header)) < len(header) or not any(header) or all(_is_number(name) for name in header):
+    try:
+        header, rows, lines = _cells(path)
+    except (csv.Error, UnicodeError) as error:
+        raise InputError(f"{path} can't be read as CSV ({error}).") from error
+    names_given = [name for name in header if name]
+    if len(set(names_given)) < len(names_given) or not names_given or all(map(_is_number, names_given)):
         raise InputError(f"The first line of {path} must have a different name for each column, such as obs_0,obs_1,action_0.")
+    if not len(rows):
+        raise InputError(f"{path} has no rows below its header of {len(header)} columns; it must have at least one.")
     groups = grouped(header)
     singles = {name: [i] for i, name in enumerate(header)}
     columns = singles | groups
     asked = {*keys.obs, *keys.action, *filter(None, (keys.reward, keys.episode))}
-    numbers = [i for i in range(len(header)) if header[i] not in TIME]
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of files without rows, which are refused below
-            rows = np.genfromtxt(path, delimiter=separator, skip_header=1, ndmin=2, dtype=np.float64, comments="\0")
-    except ValueError as error:
-        raise InputError(f"{path} has rows of different lengths ({str(error).splitlines()[-1].strip()}).") from error
-    if not len(rows) or rows.shape[1] != len(header):
-        raise InputError(
-            f"{path} has {len(rows)} rows below a header of {len(header)} columns; it must have at least one of them."
-        )
-    found = {name: rows[:, places] for name, places in columns.items() if set(places) & set(numbers) or name in asked}
+    numbers = {i for i, name in enumerate(header) if name and name.lower() not in TIME}
+    found = {name: rows[:, places] for name, places in columns.items() if set(places) & numbers or name in asked}
     used, names = chosen(found, keys, str(path))
     for meaning, chosen_names in names.items():
         if not np.isfinite(used[meaning]).all():
-            row = int(np.argmin(np.isfinite(used[meaning]).all(axis=-1)))
-            raise InputError(f"Line {row + 2} of {path} has no number in the columns {', '.join(chosen_names)}.")
+            line = lines[int(np.argmin(np.isfinite(used[meaning]).all(axis=-1)))]
+            raise InputError(f"Line {line} of {path} has no number in the columns {', '.join(chosen_names)}.")
     taken = {i for chosen_names in names.values() for name in chosen_names for i in columns[name]}
-    left = unnamed([header[i] for i in range(len(header)) if i not in taken], {})
-    time = next((rows[:, i] for i, name in enumerate(header) if name in TIME), None)
+    left = unnamed([header[i] for i in sorted(numbers - taken)], {})
+    time = next((rows[:, i] for i, name in enumerate(header) if name.lower() in TIME), None)
     tables = split(used, str(path))
     seconds = None if time is None else step_seconds(time[: len(tables[0].obs)])
     return Source("CSV", tables, names, left, step_seconds=seconds)
+
+
+def _cells(path: Path) -> tuple[list[str], np.ndarray, array[int]]:
+    """The header, the numbers below it (NaN where there is none), and the number of each row's line.
+
+    Files as spreadsheets, pandas and NumPy write them: with a byte order mark or in UTF-16, separated by commas, semicolons,
+    tabs or spaces, with decimal commas where commas don't separate, quotes, `True` and `False`, empty lines, and comments above
+    the header. NumPy makes the header a comment, too: it is the last one if the first other line has numbers alone.
+    """
+    with files.open_regular(path) as file:
+        utf16 = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        file.seek(0)
+        text = io.TextIOWrapper(file, encoding="utf-16" if utf16 else "utf-8-sig", newline="")
+        comment, head, above = "", "", 0
+        for head in text:
+            above += 1
+            if head.strip() and not head.startswith("#"):
+                break
+            comment = head if head.strip() else comment
+        separator = max(",;\t", key=head.count)
+        separator = separator if separator in head else " "
+        number = _number if separator == "," else lambda cell: _number(cell.replace(",", "."))
+        first = next(csv.reader([head], delimiter=separator, skipinitialspace=True), [])
+        numbers, lines = array("d"), array("q")
+        header = first
+        if comment and not any(math.isnan(number(cell)) for cell in first):
+            header = next(csv.reader([comment.lstrip("# ")], delimiter=separator, skipinitialspace=True))
+            numbers.extend(map(number, first))
+            lines.append(above)
+        reader = csv.reader(text, delimiter=separator, skipinitialspace=True)
+        for row in reader:
+            if row and not (len(row) == 1 < len(header) and not row[0].strip()):
+                if len(row) != len(header):
+                    where = f"line {above + reader.line_num} has {len(row)}, and the header {len(header)}"
+                    raise InputError(f"{path} has rows of different lengths: {where}.")
+                numbers.extend(map(number, row))
+                lines.append(above + reader.line_num)
+    rows = np.frombuffer(numbers, np.float64) if numbers else np.zeros(0)
+    return [name.strip() for name in header], rows.reshape(len(lines), -1) if lines else rows, lines
+
+
+def _number(cell: str) -> float:
+    """The number of a cell; NaN if it has none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return {"true": 1.0, "false": 0.0}.get(cell.strip().lower(), math.nan)
 
 
 def _time(found: dict[str, np.ndarray]) -> float | None:
@@ -91,8 +134,4 @@ def _time(found: dict[str, np.ndarray]) -> float | None:
 
 
 def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return not math.isnan(_number(text))

@@ -76,8 +76,9 @@ def chosen(found: Mapping[str, np.ndarray], keys: Keys, where: str) -> tuple[dic
     asked |= {"reward": [keys.reward] if keys.reward else [], "episode": [keys.episode] if keys.episode else []}
     used: dict[str, np.ndarray] = {}
     names: dict[str, list[str]] = {}
+    lower = {name.lower(): name for name in found}
     for meaning, usual in NAMES.items():
-        wanted = asked.get(meaning) or next(([name] for name in usual if name in found), [])
+        wanted = asked.get(meaning) or next(([lower[name]] for name in usual if name in lower), [])
         if missing := [name for name in wanted if name not in found]:
             raise InputError(f"{where} has no column {missing[0]!r}; it has {', '.join(sorted(found)[:30])}.")
         if wanted:
@@ -98,7 +99,7 @@ def chosen(found: Mapping[str, np.ndarray], keys: Keys, where: str) -> tuple[dic
 def unnamed(found: Iterable[str], names: Mapping[str, Sequence[str]]) -> list[str]:
     """What of `found` no column of `names` took, apart from `COUNTERS`, as one entry of `Source.dropped`, or none."""
     taken = {name for columns in names.values() for name in columns}
-    left = [name for name in found if name not in taken and name not in COUNTERS]
+    left = [name for name in found if name not in taken and name.lower() not in COUNTERS]
     return [f"{', '.join(left)}, which no key names"] if left else []
 
 

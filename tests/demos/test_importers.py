@@ -204,6 +204,35 @@ def test_a_csv_file_is_the_same_however_it_is_spelled(spelling: str, tmp_path: P
     assert np.array_equal(found.demos.action[:, 0], np.float32([0.05, 1e-4, 0.7])) and "no key" not in "".join(found.told)
 
 
+@pytest.mark.parametrize("format_", ["csv", "npz", "d4rl"])
+@pytest.mark.parametrize("other", [{}, {"done": [0, 1, 0, 0, 0, 0, 0, 0]}, {"episode": [0, 0, 0, 0, 0, 1, 1, 1]}], ids=str)
+def test_an_episode_begins_where_time_begins_again(tmp_path: Path, format_: str, other: dict[str, list[int]]) -> None:
+    """Three recordings one after the other in one file; a termination ends an episode, too, and numbers of episodes decide."""
+    time = np.array([0.0, 0.1, 0.2, 0.3, 0.0, 0.1, 0.0, 0.1])
+    columns = {"Time": time, "obs": np.arange(8.0), "action": np.zeros(8)} | {k: np.array(v) for k, v in other.items()}
+    source = tmp_path / f"a.{format_}"
+    if format_ == "npz":
+        np.savez(source, **columns)
+    elif format_ == "csv":
+        rows = [",".join(map(str, row)) for row in zip(*columns.values(), strict=True)]
+        source.write_text("\n".join([",".join(columns), *rows]))
+    else:
+        with h5py.File(source, "w") as file:
+            for name, column in columns.items():
+                file[name] = column
+    found = importers.load([source])
+    starts = {"": [0, 4, 6], "done": [0, 2, 4, 6], "episode": [0, 5]}[next(iter(other), "")]
+    assert [float(e.obs[0, 0]) for e in found.demos.episodes] == starts
+    assert ("Episodes: where Time begins again." in found.told) == ("episode" not in other)
+    assert not any("no key" in line for line in found.told)
+
+
+def test_dates_are_no_times(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time,obs\n" + "".join(f"2026-11-2{i} 10:00,{i}\n" for i in range(4)))
+    found = importers.load([tmp_path / "a.csv"])
+    assert found.demos.num_steps == 3 and "Left out: time, which no key names." in found.told
+
+
 def test_thousands_are_no_decimal_commas(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text('obs_0,obs_1\n1,2\n"1,234",2\n')
     with pytest.raises(InputError, match=r"Line 3 of .* has no number in the columns obs"):

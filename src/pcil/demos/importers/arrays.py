@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from pcil import files
-from pcil.demos.importers.tables import TIME, Keys, Source, chosen, grouped, split, step_seconds, unnamed
+from pcil.demos.importers.tables import Keys, Source, chosen, grouped, split, step_seconds, unnamed
 from pcil.errors import InputError
 
 LARGEST = 2**31
@@ -43,7 +43,8 @@ def read_npz(path: Path, keys: Keys) -> Source:
             else:
                 found[name] = array
     used, names = chosen(found, keys, str(path))
-    return Source("NumPy", split(used, str(path)), names, dropped + unnamed(found, names), step_seconds=_time(found))
+    tables = split(used, str(path))
+    return Source("NumPy", tables, names, dropped + unnamed(found, names), step_seconds=step_seconds(used, tables))
 
 
 def is_csv(path: Path) -> bool:
@@ -63,23 +64,19 @@ def read_csv(path: Path, keys: Keys) -> Source:
         raise InputError(f"The first line of {path} must have a different name for each column, such as obs_0,obs_1,action_0.")
     if not len(rows):
         raise InputError(f"{path} has no rows below its header of {len(header)} columns; it must have at least one.")
-    groups = grouped(header)
-    singles = {name: [i] for i, name in enumerate(header)}
-    columns = singles | groups
-    asked = {*keys.obs, *keys.action, *filter(None, (keys.reward, keys.episode))}
-    numbers = {i for i, name in enumerate(header) if name and name.lower() not in TIME}
-    found = {name: rows[:, places] for name, places in columns.items() if set(places) & numbers or name in asked}
+    columns = {name: [i] for i, name in enumerate(header) if name} | grouped(header)
+    found = {name: rows[:, places] for name, places in columns.items() if name}
     used, names = chosen(found, keys, str(path))
-    for meaning, chosen_names in names.items():
-        if not np.isfinite(used[meaning]).all():
-            line = lines[int(np.argmin(np.isfinite(used[meaning]).all(axis=-1)))]
-            raise InputError(f"Line {line} of {path} has no number in the columns {', '.join(chosen_names)}.")
-    taken = {i for chosen_names in names.values() for name in chosen_names for i in columns[name]}
-    left = unnamed([header[i] for i in sorted(numbers - taken)], {})
-    time = next((rows[:, i] for i, name in enumerate(header) if name.lower() in TIME), None)
+    if "time" in used and not np.isfinite(used["time"]).all():
+        del used["time"]  # such as dates
+    for meaning, column in used.items():
+        if not np.isfinite(column).all():
+            line = lines[int(np.argmin(np.isfinite(column).all(axis=-1)))]
+            raise InputError(f"Line {line} of {path} has no number in the columns {', '.join(names[meaning])}.")
+    taken = {i for meaning in used for name in names[meaning] for i in columns[name]}
+    left = unnamed([name for i, name in enumerate(header) if name and i not in taken], {})
     tables = split(used, str(path))
-    seconds = None if time is None else step_seconds(time[: len(tables[0].obs)])
-    return Source("CSV", tables, names, left, step_seconds=seconds)
+    return Source("CSV", tables, names, left, step_seconds=step_seconds(used, tables))
 
 
 def _cells(path: Path) -> tuple[list[str], np.ndarray, array[int]]:
@@ -127,10 +124,6 @@ def _number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return {"true": 1.0, "false": 0.0}.get(cell.strip().lower(), math.nan)
-
-
-def _time(found: dict[str, np.ndarray]) -> float | None:
-    return next((step_seconds(found[name]) for name in TIME if name in found and found[name].ndim == 1), None)
 
 
 def _is_number(text: str) -> bool:

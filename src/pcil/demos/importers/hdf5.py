@@ -56,7 +56,8 @@ def _robomimic(path: Path, found: dict[str, np.ndarray], dropped: list[str], epi
         if set(wanted) <= after.keys():
             used["next_obs"] = chosen(after, Keys(wanted), where)[0]["obs"]
         done = used.pop("terminated", np.zeros(1)).reshape(-1)
-        (table,) = split({name: column for name, column in used.items() if name not in ("truncated", "episode", "ends")}, where)
+        others = ("truncated", "episode", "ends", "time")
+        (table,) = split({name: column for name, column in used.items() if name not in others}, where)
         tables.append(table._replace(terminated=bool(done[-1])))
     shared = sorted({name.split("/", 2)[2] for name in dropped if name.startswith("data/demo_")})
     shown = [f"{name}, which is no rows of numbers" for name in shared]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,11 +20,11 @@ NAMES: dict[str, tuple[str, ...]] = {
     "truncated": ("timeouts", "timeout", "truncations", "truncated", "next.truncated"),
     "episode": ("episode", "episodes", "episode_index", "episode_id", "episode_ids"),
     "ends": ("episode_ends",),
+    "time": ("time", "t", "timestamp", "seconds"),
 }
 """What columns are called, the most usual name first."""
-TIME = ("time", "t", "timestamp", "seconds")
-COUNTERS = (*TIME, "step", "index", "frame_index", "episode_index", "task_index")
-"""Columns that number or time the rows; when nothing uses them, that is not worth a line."""
+COUNTERS = ("step", "index", "frame_index", "episode_index", "task_index")
+"""Columns that number the rows; when nothing uses them, that is not worth a line."""
 
 
 @dataclass
@@ -93,7 +93,16 @@ def chosen(found: Mapping[str, np.ndarray], keys: Keys, where: str) -> tuple[dic
             f"{where} has no observations: none of its columns ({', '.join(sorted(found)[:30])}) is called "
             f"{', '.join(NAMES['obs'][:3])}; name them by --obs-keys."
         )
+    if restarts(used).any():
+        names["episode"] = [f"where {names['time'][0]} begins again"]
     return used, names
+
+
+def restarts(used: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Whether each row but the first is earlier than the row before, in columns that have times but no episodes."""
+    if "time" not in used or used["obs"].ndim == 3 or {"episode", "ends"} & used.keys():
+        return np.zeros(0, bool)
+    return np.diff(used["time"].reshape(-1).astype(np.float64)) < 0
 
 
 def unnamed(found: Iterable[str], names: Mapping[str, Sequence[str]]) -> list[str]:
@@ -106,8 +115,8 @@ def unnamed(found: Iterable[str], names: Mapping[str, Sequence[str]]) -> list[st
 def split(used: Mapping[str, np.ndarray], where: str) -> list[Table]:
     """The episodes of columns as `chosen` gives them.
 
-    An episode ends where its number changes, or with a row that is terminated or truncated; without any of these, all rows are
-    one. Observations of three axes are `[episodes, T, O]`.
+    An episode ends where its number changes; without numbers, with a row that is terminated or truncated, and before a row
+    whose time is earlier; without any of these, all rows are one. Observations of three axes are `[episodes, T, O]`.
     """
     obs = used["obs"]
     if obs.ndim == 3:
@@ -132,7 +141,8 @@ def split(used: Mapping[str, np.ndarray], where: str) -> list[Table]:
         ends = np.append(np.flatnonzero(np.diff(used["episode"].reshape(-1)[:rows])) + 1, rows)
     else:
         over = flags["terminated"][:rows] | flags["truncated"][:rows]
-        ends = np.unique(np.append(np.flatnonzero(over) + 1, rows))
+        begun = np.flatnonzero(restarts(used)[: rows - 1]) + 1
+        ends = np.unique(np.concatenate([np.flatnonzero(over) + 1, begun, [rows]]))
     made = []
     for start, end in zip([0, *ends[:-1]], ends, strict=True):
         whole = end == rows and len(obs) == rows + 1
@@ -154,8 +164,10 @@ def grouped(names: Sequence[str]) -> dict[str, list[int]]:
     return groups
 
 
-def step_seconds(times: Any) -> float | None:
-    """The time between two rows, where it is always about the same."""
-    between = np.diff(np.asarray(times, np.float64).reshape(-1))
+def step_seconds(used: Mapping[str, np.ndarray], tables: Sequence[Table]) -> float | None:
+    """The time between two rows of the first episode, where it is always about the same."""
+    if "time" not in used:
+        return None
+    between = np.diff(used["time"].reshape(-1)[: len(tables[0].obs)].astype(np.float64))
     usual = float(np.median(between)) if len(between) else 0.0
     return usual if usual > 0 and np.mean(np.abs(between - usual) < 0.01 * usual) > 0.9 else None

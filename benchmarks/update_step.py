@@ -1,5 +1,7 @@
 """Updates on one thread, compared with their matrix products alone: `python benchmarks/update_step.py [TASK]`.
 
+The core's peak is the rate of a product of two 1024 x 1024 matrices, measured in turn with the update.
+
 With settings, PCIL's `default` update is compared with the same update with them, one more in each row, in one process:
 `python benchmarks/update_step.py walker_walk reward.penalty_rows=32 agent.cloning=true`.
 """
@@ -22,13 +24,15 @@ def main(task: str = "walker_walk", *changes: str) -> None:
         spec = envs.spec(env)
     if changes:
         return compare(task, spec, changes)
-    shared.print_row(task, "update, ms", "products, ms", "ratio")
+    shared.print_row(task, "update, ms", "products, ms", "ratio", "of the peak", "its products")
     for preset in presets.PRESETS:
         for method in presets.METHODS:
             setup = parts.Setup(presets.make(task, method, preset), spec)
-            took = parts.medians({"update_ms": setup.update, "floor_ms": setup.floor}, seconds=3)
-            update, floor = took["update_ms"], took["floor_ms"]
-            shared.print_row(f"{preset} {method}", f"{update:.2f}", f"{floor:.2f}", f"{update / floor:.2f}")
+            timed = {"update_ms": setup.update, "floor_ms": setup.floor, "large_ms": parts.large_product}
+            update, floor, large = parts.medians(timed, seconds=3).values()
+            peak = setup.flops * large / (2 * parts.LARGE**3)  # the time of as many FLOPs in the large product
+            shares = f"{peak / update:.2f}", f"{peak / floor:.2f}"
+            shared.print_row(f"{preset} {method}", f"{update:.2f}", f"{floor:.2f}", f"{update / floor:.2f}", *shares)
     return None
 
 

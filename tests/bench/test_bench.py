@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from pcil import bench
 from pcil.bench import parts
+from pcil.bench.parts import flops
 from pcil.envs.toy import PointMass
 from pcil.training import learner, presets
 from pcil.training.config import Run
@@ -46,12 +47,6 @@ def loss(weights: tuple[Array, Array], x: Float[Array, "batch in"]) -> Float[Arr
 def products(function: Any, *arguments: Any) -> list[Any]:
     """The matrix products that the benchmark finds in a function."""
     return list(parts._dot_generals(jax.make_jaxpr(function)(*arguments).jaxpr))
-
-
-def flops(equation: Any) -> int:
-    """Two for each multiplication: twice the size of the result times the length of the summed axis."""
-    (contracted, _), _ = equation.params["dimension_numbers"]
-    return 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(equation.invars[0].aval.shape[i] for i in contracted)
 
 
 def signature(equation: Any) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import statistics
 import tempfile
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
@@ -21,6 +23,9 @@ from pcil.training.config import Run
 from pcil.training.learner import on_host
 from pcil.training.replay import Replay
 from pcil.types import Batch, Episode, Spec
+
+LARGE = 1024
+"""Rows and columns of the product that measures a core's peak, `2 LARGE^3` FLOPs."""
 
 
 class Setup:
@@ -48,7 +53,8 @@ class Setup:
         self.obs = normal(spec.obs_dim)
         step = functools.partial(learner.update, run.learner)
         jaxpr = jax.make_jaxpr(step)(self.state, self.window, self.expert, None, np.int32(0), np.int32(0), self.cloned)
-        self.products = _products(list(_dot_generals(jaxpr.jaxpr)))
+        found = list(_dot_generals(jaxpr.jaxpr))
+        self.products, self.flops = _products(found), sum(map(flops, found))
 
     def update(self, times: int) -> None:
         """Do `times` updates, and wait for them at the end."""
@@ -82,6 +88,25 @@ def _dot_generals(jaxpr: Any) -> Iterator[Any]:
             yield equation
         for inner in core.jaxprs_in_params(equation.params):
             yield from _dot_generals(inner)
+
+
+def flops(equation: Any) -> int:
+    """Two for each multiplication: twice the size of the result times the length of the summed axes."""
+    (contracted, _), _ = equation.params["dimension_numbers"]
+    return 2 * math.prod(equation.outvars[0].aval.shape) * math.prod(equation.invars[0].aval.shape[i] for i in contracted)
+
+
+def large_product(times: int) -> None:
+    """Multiply two matrices of `LARGE` rows and columns, which a core does at its highest rate."""
+    operand = jnp.ones((LARGE, LARGE))
+    for _ in range(times):
+        result = _squared(operand)
+    jax.block_until_ready(result)
+
+
+@jax.jit
+def _squared(x: Any) -> Any:
+    return x @ x
 
 
 def _products(equations: list[Any]) -> Callable[[], Any]:

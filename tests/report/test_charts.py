@@ -7,12 +7,12 @@ import json
 import pytest
 from test_figures import curve
 
-from pcil.report import charts
+from pcil.report import charts, stats
 from pcil.report.load import Collection
 
 
 def made(rows: list) -> dict[str, dict]:
-    found = charts.of(Collection(rows, [], {}, []))
+    found = charts.of(Collection(rows, [], {}, []), stats.share_curves(rows))
     json.dumps(found, allow_nan=False)
     return {chart["title"]: chart for chart in found}
 

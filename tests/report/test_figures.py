@@ -14,7 +14,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 
-from pcil.report import figures, tables
+from pcil.report import figures, stats, tables
 from pcil.report.load import EvalRow, TransitionRow
 from pcil.training import presets
 
@@ -178,7 +178,7 @@ def test_tasks_together_are_an_iqm_of_shares(tmp_path: Path, drawn: list[Axes]) 
     rows = curve("a", "pcil", 1, 0, 5, expert=10.0) + curve("a", "pcil", 2, 0, 7, expert=10.0)
     rows += curve("b", "pcil", 1, 0, 6, expert=20.0) + curve("b", "pcil", 2, 0, 20, expert=20.0)
     rows += curve("c", "dac", 1, 3, 4, expert=None)
-    figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows))
+    figures.aggregate(stats.share_curves(rows), tmp_path / "all", figures.assign_styles(rows))
     (axes,) = drawn
     assert np.allclose(lines(axes)["pcil"], [0, 0.6]) and axes.get_title() == "2 tasks" and "dac" not in lines(axes)
     assert np.allclose(axes.collections[0].get_datalim(axes.transData).intervaly, [0, 0.85])
@@ -189,14 +189,15 @@ def test_a_method_without_steps_is_a_level_line(tmp_path: Path, drawn: list[Axes
     rows = curve("a", "bc", 1, 0, 1, 4) + curve("a", "bc", 2, 0, 1, 6)
     rows += curve("a", "pcil", 1, 0, 9) + curve("b", "pcil", 1, 0, 9)
     figures.grid(rows, tmp_path / "grid", columns=2)
-    figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows))
+    figures.aggregate(stats.share_curves(rows), tmp_path / "all", figures.assign_styles(rows))
     assert lines(drawn[0])["bc"] == [5, 5] and drawn[0].get_title() == "a, 1 to 2 seeds"
     assert lines(drawn[2]) == {"pcil (2 tasks)": [0, 1], "bc (1 task)": [pytest.approx(5 / 9)] * 2, "demos": [1, 1]}
 
 
 def test_without_an_expert_there_is_nothing_to_put_together(tmp_path: Path) -> None:
     rows = curve("a", "pcil", 1, 0, 5, expert=None)
-    assert figures.aggregate(rows, tmp_path / "all", figures.assign_styles(rows)) == "" and not list(tmp_path.iterdir())
+    assert figures.aggregate(stats.share_curves(rows), tmp_path / "all", figures.assign_styles(rows)) == ""
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_same_grid_is_the_same_file(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ DIGITS = 5
 """Significant digits of the numbers."""
 
 
-def of(found: Collection) -> list[dict[str, Any]]:
-    """A chart for all tasks together, if there are several, and one for each task.
+def of(found: Collection, together: stats.Shares) -> list[dict[str, Any]]:
+    """A chart for all tasks `together`, if there are several, and one for each task.
 
     A chart has a `title`, the label `y` of its axis, the `frames` of all its lines, the return of the `expert` or None, and
     `lines`: `name`, `colour`, `dashes`, and `center`, `low` and `high` with a value, or None, for each of the frames.
@@ -23,7 +23,6 @@ def of(found: Collection) -> list[dict[str, Any]]:
     styles, tasks = assign_styles(found.rows), list(dict.fromkeys(row.task for row in found.rows))
     names = {name: label(name, styles) for name in styles}
     made = []
-    together = stats.share_curves(found.rows)
     if len(tasks) > 1 and together:
         lines = [(name, names[name], styles[name], together[name][0]) for name in styles if name in together]
         made.append(_chart("all tasks together", "share of the demonstrations' return", 1.0, lines))

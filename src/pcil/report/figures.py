@@ -89,14 +89,14 @@ def assign_styles(rows: Iterable[EvalRow | TransitionRow]) -> dict[tuple[str, st
     return found
 
 
-def learning_curves(found: Collection, folder: Path) -> None:
+def learning_curves(found: Collection, together: stats.Shares, folder: Path) -> None:
     """Draw the mean over seeds with Student's 95% interval as a band, and each seed as a thin line: all tasks on one sheet,
-    each on its own, and interquartile means over each method's own tasks with a bootstrap interval."""
+    each on its own, and `together`, the interquartile means over each method's own tasks."""
     styles = assign_styles(found.rows)
     grid(found.rows, folder / "curves", styles=styles)
     for _, file, rows in _by_task(found, found.rows):
         grid(rows, folder / f"curves-{file}", styles=styles)
-    aggregate(found.rows, folder / "aggregate", styles)
+    aggregate(together, folder / "aggregate", styles)
 
 
 def profiles(found: Collection, folder: Path) -> dict[str, str]:
@@ -200,13 +200,12 @@ def grid(
     return save(figure, path)
 
 
-def aggregate(rows: Sequence[EvalRow], path: Path, styles: dict[tuple[str, str], Style]) -> str:
+def aggregate(found: stats.Shares, path: Path, styles: dict[tuple[str, str], Style]) -> str:
     """Draw the share of the expert's return over frames: each method's IQM over seeds and tasks, with bootstrap intervals.
 
     If methods have different numbers of tasks, the legend states the number. If no task has a known expert, nothing is drawn
     and "" is returned.
     """
-    found = stats.share_curves(rows)
     if not found:
         return ""
     figure, (axis,) = _axes(1, 1)

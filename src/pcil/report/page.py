@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment
 
 from pcil.errors import InputError, shown
-from pcil.report import charts, figures, tables
+from pcil.report import charts, figures, stats, tables
 from pcil.report.load import Collection, write_rows
 
 WEB = Path(__file__).with_name("web")
@@ -47,7 +47,8 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
     write_rows(out / "tables" / "evaluations.csv", found.rows)
     if found.transitions:
         write_rows(out / "tables" / "transitions.csv", found.transitions)
-    figures.learning_curves(found, out / "figures")
+    together = stats.share_curves(found.rows)
+    figures.learning_curves(found, together, out / "figures")
     drawn = {
         tables.title_and_caption(make): {title: _uri("svg+xml", svg.encode()) for title, svg in pictures.items()}
         for make in figures.FIGURES
@@ -61,7 +62,7 @@ def build(found: Collection, out: Path, films: Mapping[str, bytes]) -> Path:
         found=found,
         last={row[:4]: row for row in found.rows},
         tables=[(name, *tables.title_and_caption(tables.MAKERS[name]), table) for name, table in written.items()],
-        charts=charts.of(found),
+        charts=charts.of(found, together),
         web={name: (WEB / name).read_text() for name in ("uplot.css", "uplot.js", "charts.js")},
         figures=drawn,
         films={title: _uri("webp", film) for title, film in films.items()},

@@ -144,7 +144,11 @@ def curve(runs: Sequence[Sequence[EvalRow]], value: str = "return_mean") -> Curv
     return Curve(frames, *np.array([mean_interval(column) for column in values.T]).reshape(-1, 3).T)
 
 
-def share_curves(rows: Iterable[EvalRow]) -> dict[tuple[str, str], tuple[Curve, int]]:
+Shares = dict[tuple[str, str], tuple[Curve, int]]
+"""A curve over all tasks of a method and variant, and the number of tasks."""
+
+
+def share_curves(rows: Iterable[EvalRow]) -> Shares:
     """Of each method and variant: the IQM over seeds and tasks of the share of the expert's return, at the frames that all of
     them have, with a bootstrap interval, and the number of tasks whose expert is known."""
     strata: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}

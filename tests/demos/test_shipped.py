@@ -20,18 +20,25 @@ POLICIES = demos.SHIPPED.parent / "policies"
 
 
 def test_the_quickstart_has_its_demonstrations() -> None:
-    assert {"walker_walk", "finger_spin", "hopper_stand"} <= set(TASKS) <= set(envs.TASKS)
+    assert TASKS[:10] == sorted(envs.TASKS) and "Hopper-v5" in TASKS[10:]
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_plain_minari_reads_ten_episodes_of_the_environments_sizes(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(demos.SHIPPED))
-    dataset = minari.load_dataset(f"dmc/{task}/expert-v0")
+    suite, steps = ("dmc", 500) if task in envs.TASKS else ("gymnasium", 1000)
+    dataset = minari.load_dataset(f"{suite}/{task}/expert-v0")
     spec = envs.spec(envs.make(task))
-    assert (dataset.total_episodes, dataset.total_steps) == (10, 5000)
+    assert (dataset.total_episodes, dataset.total_steps) == (10, 10 * steps)
     for episode in dataset.iterate_episodes():
-        assert episode.observations.shape == (501, spec.obs_dim) and episode.actions.shape == (500, spec.action_dim)
+        assert episode.observations.shape == (steps + 1, spec.obs_dim) and episode.actions.shape == (steps, spec.action_dim)
         assert episode.truncations[-1] and not episode.terminations.any()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_dataset_is_found_by_its_task_and_by_its_id(task: str) -> None:
+    suite = "dmc" if task in envs.TASKS else "gymnasium"
+    assert demos.Demonstrations.load(f"{suite}/{task}/expert-v0").hash == demos.Demonstrations.load(task).hash
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -225,6 +225,14 @@ def test_a_missing_package_is_named(register_env: Any) -> None:
             make(name)
 
 
+def test_a_robot_of_gymnasiums_names_the_packages_that_bring_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("gymnasium.envs.mujoco")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    with pytest.raises(InputError, match=r"not installed: .*imageio.*; pip install \"gymnasium\[mujoco\]\" brings it\.$"):
+        make("Hopper-v5")
+
+
 def test_timing_has_bare_physics_only_for_deepmind_control() -> None:
     measured = measure_env("pendulum_swingup", episodes=1)
     assert measured.keys() == {"env_step_us", "physics_us", "ratio"}

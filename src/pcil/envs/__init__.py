@@ -148,7 +148,9 @@ def _made(task: Any, render_mode: str | None, env_kwargs: dict[str, Any] | None)
     except InputError as error:
         raise InputError(f"The environment {task!r} can't be made: {error}") from error
     except (gymnasium.error.DependencyNotInstalled, ImportError) as error:
-        raise InputError(f"The environment {task!r} needs a package that is not installed: {error}") from error
+        robot = str(getattr(gymnasium.registry.get(env_id), "entry_point", "")).startswith("gymnasium.envs.mujoco")
+        hint = f'{str(error).removesuffix(".")}; pip install "gymnasium[mujoco]" brings it.' if robot else str(error)
+        raise InputError(f"The environment {task!r} needs a package that is not installed: {hint}") from error
     except gymnasium.error.Error as error:
         if env_id.rpartition(":")[2] not in gymnasium.registry:
             _refuse_name(task, error)

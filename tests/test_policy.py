@@ -226,7 +226,7 @@ def test_where_there_is_no_policy_the_sentence_says_what_to_give(folder: Path, m
     path = folder / "nowhere" if missing is None else folder
     (folder / (missing or "policy.json")).unlink()
     message = refusal(lambda: load_policy(path))
-    known = r"a task whose expert ships \(acrobot_swingup, .*, walker_walk\)\."
+    known = r"a task whose expert ships \(acrobot_swingup, .*, walker_walk, Hopper-v5, .*\)\."
     assert re.fullmatch(
         rf"{re.escape(str(path))} holds no policy \(.*\); give a run folder that pcil train made, or {known}", message
     )

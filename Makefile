@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.ready
+EXTRAS := --extra report --extra sweep --extra onnx --extra film --extra mujoco --extra lerobot --extra wandb --extra mlflow
 
 # make mutants FILES="losses noise" N=200: shows which changes of the source no test notices (docs/mutants.md)
 # make fuzz N=2000, make kills N=100: test randomly changed inputs, and runs that are killed and damaged (docs/reliability.md)
@@ -14,7 +15,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml uv.lock
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --extra report --extra sweep --extra onnx --extra film --extra mujoco --extra lerobot --extra wandb --extra mlflow --inexact --quiet
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen $(EXTRAS) --inexact --quiet
 	touch $(STAMP)
 
 train: $(STAMP)
@@ -56,7 +57,7 @@ archive: $(STAMP)
 	$(BIN)/python experiments/archive.py
 
 docs: $(STAMP)
-	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs --extra report --extra sweep --extra onnx --extra film --extra mujoco --extra lerobot --extra wandb --extra mlflow --inexact --quiet
+	VIRTUAL_ENV=$(CURDIR)/.venv $(BIN)/uv sync --frozen --group docs $(EXTRAS) --inexact --quiet
 	$(BIN)/mkdocs build
 
 format: $(STAMP)

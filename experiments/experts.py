@@ -90,14 +90,13 @@ def record_again(task: str, seed: int, minimum_return: float) -> None:
     info["record_command"] = f"python experiments/experts.py --record {task}"
     recorded = record(task, load_policy(POLICIES / task), seed, minimum_return, info)
     said = f"{recorded.return_mean:.1f} +- {recorded.return_std:.1f}, least {recorded.returns.min():.1f}"
-    if recorded.hash == shipped.hash:
-        place(task, recorded)
-        print(f"{task}: {said}, the same arrays as the included ones")
-    elif shipped.returns.min() >= minimum_return:
-        print(f"{task}: {said}, not the included arrays, which satisfy the rule ({shipped.returns.min():.1f}) and are kept")
-    else:
-        place(task, recorded)
-        print(f"{task}: {said}, replacing the old ones ({shipped.return_mean:.1f}, least {shipped.returns.min():.1f})")
+    least, same = shipped.returns.min(), recorded.hash == shipped.hash
+    if not same and least >= minimum_return:
+        print(f"{task}: {said}, not the included arrays, which satisfy the rule ({least:.1f}) and are kept")
+        return
+    place(task, recorded)
+    replaced = f"replacing the old ones ({shipped.return_mean:.1f}, least {least:.1f})"
+    print(f"{task}: {said}, {'the same arrays as the included ones' if same else replaced}")
 
 
 def ship(task: str, *, folder: Path, wanted: float, tries: int, include: bool, seed: int, minimum_return: float) -> None:

@@ -126,7 +126,8 @@ def load_policy(path: str | Path, trust: Sequence[str] = ()) -> Policy:
     """
     from safetensors import SafetensorError
 
-    folder, shipped = Path(path), sorted((file.parent.name for file in SHIPPED.glob("*/policy.json")), key=str.swapcase)
+    names = (file.parent.name for file in SHIPPED.glob("*/policy.json"))
+    folder, shipped = Path(path), sorted(names, key=str.swapcase)  # those of DeepMind Control, in small letters, come first
     folder = SHIPPED / str(path) if str(path) in shipped and not folder.exists() else folder
     folder = folder / "policy" if (folder / "policy").is_dir() else folder
     if not (folder / "policy.json").is_file() or not (folder / "policy.safetensors").is_file():

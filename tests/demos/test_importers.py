@@ -233,6 +233,12 @@ def test_dates_are_no_times(tmp_path: Path) -> None:
     assert found.demos.num_steps == 3 and "Left out: time, which no key names." in found.told
 
 
+def test_times_with_holes_are_no_times_and_nothing_else_is_said(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("time,obs\n0,1\n1,2\n0,3\n,4\n")
+    found = importers.load([tmp_path / "a.csv"])
+    assert len(found.demos.episodes) == 1 and not any("begins again" in line for line in found.told)
+
+
 def test_thousands_are_no_decimal_commas(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text('obs_0,obs_1\n1,2\n"1,234",2\n')
     with pytest.raises(InputError, match=r"Line 3 of .* has no number in the columns obs"):

@@ -28,17 +28,18 @@ def opened(task: str, env_kwargs: dict[str, Any]) -> Iterator[tuple[envs.Checked
     if not envs.gymnasium_id(task).startswith("dmc/"):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*HumanRendering wrapper")  # Gymnasium shows the pictures of other environments
-            begun = threading.Event()
+            begun = False
 
             def refresh() -> bool:
-                begun.set()
+                nonlocal begun
+                begun = True
                 return True  # it draws itself in `reset` and `step`
 
             try:
                 with envs.opened(task, render_mode="human", env_kwargs=env_kwargs) as env:
                     yield env, refresh
             except RunError as error:
-                if begun.is_set():
+                if begun:
                     raise
                 raise InputError(_instead(str(error))) from error
         return

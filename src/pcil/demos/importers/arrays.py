@@ -67,8 +67,6 @@ def read_csv(path: Path, keys: Keys) -> Source:
     columns = {name: [i] for i, name in enumerate(header) if name} | grouped(header)
     found = {name: rows[:, places] for name, places in columns.items() if name}
     used, names = chosen(found, keys, str(path))
-    if "time" in used and not np.isfinite(used["time"]).all():
-        del used["time"]  # such as dates
     for meaning, column in used.items():
         if not np.isfinite(column).all():
             line = lines[int(np.argmin(np.isfinite(column).all(axis=-1)))]

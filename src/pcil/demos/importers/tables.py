@@ -83,6 +83,8 @@ def chosen(found: Mapping[str, np.ndarray], keys: Keys, where: str) -> tuple[dic
             raise InputError(f"{where} has no column {missing[0]!r}; it has {', '.join(sorted(found)[:30])}.")
         if wanted:
             columns = [np.asarray(found[name]) for name in wanted]
+            if meaning == "time" and not np.isfinite(columns[0]).all():
+                continue  # such as dates
             if len({len(column) for column in columns}) > 1:
                 raise InputError(f"The columns {', '.join(wanted)} of {where} have different lengths.")
             wide = [column.reshape(len(column), -1) if column.ndim < 3 else column for column in columns]

@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from pcil.cli import exit_code
+from pcil.errors import InputError
 from pcil.files import flat
 from pcil.report.load import read_rows, read_run, sort_key, write_rows
 from pcil.report.variants import NO_VARIANT
@@ -16,8 +18,11 @@ from pcil.training import presets
 from pcil.training.config import renamed
 
 
-def main(target: str, *folders: str) -> None:
+def main(*words: str) -> None:
     """Replace or add the rows of the runs."""
+    if len(words) < 2:
+        raise InputError("Give the CSV file, and one or more folders with runs.")
+    target, *folders = words
     rows = [row for folder in finished(folders) for row in read_run(folder, variant(settings(folder)))]
     new = {row[:4] for row in rows}
     kept = [row for row in read_rows(Path(target)) if row[:4] not in new] if Path(target).exists() else []
@@ -45,4 +50,4 @@ def variant(run: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    sys.exit(exit_code(lambda: main(*sys.argv[1:])))

@@ -11,6 +11,8 @@ import statistics
 import sys
 from pathlib import Path
 
+from pcil.cli import exit_code
+from pcil.errors import InputError
 from pcil.report import tables
 from pcil.report.load import EvalRow, read_rows
 from pcil.sweep import plans
@@ -18,8 +20,11 @@ from pcil.sweep import plans
 RESULTS = Path(__file__).parent.parent / "results"
 
 
-def main(file: str, *cores: str) -> None:
+def main(*words: str) -> None:
     """Print the core-hours of each method, and the hours on each number of cores."""
+    if not words or not all(word.isdecimal() and int(word) for word in words[1:]):
+        raise InputError("Give the TOML file of a sweep, and then numbers of cores.")
+    file, *cores = words
     measured = seconds_per_frame()
     plan = plans.read(Path(file), Path("runs/nowhere"))
     took = [job.run.frames * measured[job.run.method] for job in plan.jobs]
@@ -54,4 +59,4 @@ def ended(took: list[float], cores: int) -> float:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    sys.exit(exit_code(lambda: main(*sys.argv[1:])))

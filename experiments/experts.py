@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from pcil import demos, envs
+from pcil import cli, demos, envs
 from pcil.card import card
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
@@ -56,8 +55,8 @@ def best(task: str, settings: dict[str, Any]) -> Path:
     for seed in seeds:
         folder = RUNS / f"{task}-{seed}"
         words = f"train {task} --method expert --preset reward-only --seed {seed}".split()
-        command = [*words, *options, "--out", str(folder)]
-        subprocess.run([sys.executable, "-m", "pcil", *command], check=True)
+        if code := cli.main([*words, *options, "--out", str(folder)]):
+            sys.exit(code)
         finished[folder] = runs.read_done(folder)
     return max(finished, key=lambda folder: finished[folder])
 
@@ -120,4 +119,4 @@ def ship(task: str, *, folder: Path, wanted: float, tries: int, include: bool, s
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(cli.exit_code(lambda: main(sys.argv[1:])))

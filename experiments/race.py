@@ -86,6 +86,7 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
     """The rows of one competitor; it prints each as it is measured."""
     from pcil.demos import Demonstrations
     from pcil.seeds import Stream, episode_seed
+    from pcil.training.runs import commit
 
     demos = Demonstrations.load(task)
     with tempfile.TemporaryDirectory() as place:
@@ -96,7 +97,7 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
         request = {"competitor": name, "task": task, "seed": seed, "minutes": minutes, "starts": starts}
         request |= {"demos": f"{place}/demos.npz", "out": f"{place}/run"}
         errors, pipe = Path(place) / "errors.txt", subprocess.PIPE
-        command, source = python(COMPETITORS[name]), commit()
+        command, source = python(COMPETITORS[name]), commit() or ""
         with (
             errors.open("w") as said,
             subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said, text=True, env=one_core(), cwd=place) as child,
@@ -120,12 +121,6 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
             raise SystemExit(f"{name} on {task} ended with exit code {child.returncode}: {errors.read_text()[-2000:]}")
         remember(memory_mb={name: memory})
     return rows
-
-
-def commit() -> str:
-    """The commit at hand, with a "+" if the working tree has changes, as in a run's folder."""
-    git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()  # noqa: E731
-    return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "src", "experiments") else "")
 
 
 def compete(request: dict[str, Any]) -> int:

@@ -8,10 +8,10 @@ runs resume, and stages whose rows are there are skipped.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
+from pcil import cli
 from pcil.report import load, representation
 
 FOLDER = Path("runs/representation")
@@ -34,7 +34,8 @@ def add(task: str, method: str, seed: int, stage: str, frames: int) -> None:
     """Train a run to a stage, and add what its networks say of expert and agent there."""
     out = FOLDER / task / method / str(seed)
     words = f"train {task} --method {method} --preset reward-only --seed {seed} --frames {frames} --out {out}".split()
-    subprocess.run([sys.executable, "-m", "pcil", *words], check=True)
+    if code := cli.main(words):
+        sys.exit(code)
     found = load.collect([out], representation.with_defaults)
     representation.add(found)
     made = [row._replace(variant=stage) for row in found.transitions]
@@ -48,4 +49,4 @@ def rows() -> list[load.TransitionRow]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(cli.exit_code(lambda: main(sys.argv[1:])))

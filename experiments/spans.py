@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from pcil.cli import exit_code
+
 SPANS = ((5, 50), (50, 100), (100, 150), (150, 200))
 """Spans, in thousands of frames."""
 ROWS = {
@@ -38,4 +40,5 @@ def main(*folders: str) -> None:
         print(f"| {words} |{''.join(cells)}")
 
 
-main(*sys.argv[1:])
+if __name__ == "__main__":
+    sys.exit(exit_code(lambda: main(*sys.argv[1:])))

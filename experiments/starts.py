@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from pcil.cli import exit_code
 from pcil.report import tables
 
 ROWS = Path(__file__).parent.parent / "results" / "starts.json"
@@ -64,4 +65,4 @@ def table() -> tables.Table:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    sys.exit(exit_code(lambda: main(*sys.argv[1:])))

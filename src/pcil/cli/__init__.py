@@ -4,7 +4,7 @@ import importlib
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from pcil import errors
 from pcil.errors import InputError
@@ -34,12 +34,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # for terminals that can't show every character
     argv = list(sys.argv[1:] if arguments is None else arguments)
+    return exit_code(lambda: _command(argv), resumes=argv[:1] in (["train"], ["sweep"]))
+
+
+def exit_code(command: Callable[[], int | None], *, resumes: bool = False) -> int:
+    """Run a command and return its exit code. What it raises becomes a sentence on standard error, unless it is a bug of ours.
+
+    `resumes` says that the same command goes on after an interruption.
+    """
     try:
-        code = _command(argv)
+        code = command()
         sys.stdout.flush()
-        return code
+        return code or 0
     except KeyboardInterrupt:
-        again = "; the same command goes on from the last checkpoint" if argv[0] in ("train", "sweep") else ""
+        again = "; the same command goes on from the last checkpoint" if resumes else ""
         print(f"pcil: stopped{again}.", file=sys.stderr)
         return 130
     except BrokenPipeError:

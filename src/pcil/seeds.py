@@ -34,6 +34,8 @@ class Stream(enum.IntEnum):
     """Samples for behavioural cloning before the first update; the counter is 0."""
     NOISE = 10
     """Noise of an evaluation; the counter is the index of the evaluation episode."""
+    SELECT = 11
+    """Resets of the episodes by which a policy is kept; the counter is the index of the episode."""
 
 
 def key(root: Any, stream: Stream, counter: Any) -> Any:

@@ -96,6 +96,9 @@ class Run:
     """Frames between two evaluations."""
     evaluate_episodes: int = 10
     """Episodes per evaluation."""
+    keep_best: bool = False
+    """Evaluate and save, of the policy of now and the one saved before, the one that the present reward pays more, in as many
+    episodes as an evaluation has, from other starts. The environment's own reward has no part in it."""
     checkpoint_seconds: float = 120.0
     """Minimum time between two checkpoints, in seconds; checkpoints are written between episodes and when the run stops."""
     keep_replay: bool = True

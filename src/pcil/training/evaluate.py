@@ -18,6 +18,7 @@ from pcil.envs.rollout import Rollout
 from pcil.errors import InputError
 from pcil.policy import Policy, load_policy
 from pcil.seeds import Stream, episode_seed, rng
+from pcil.types import Episode
 
 LOCKSTEP = 32
 """Maximum number of episodes that are played at once."""
@@ -35,6 +36,8 @@ class Evaluation:
     """Wall-clock time of the evaluation."""
     info: dict[str, np.ndarray] = field(default_factory=dict)
     """The numbers in the environment's last `info` of each episode, by name; only those that every episode reports."""
+    episodes: tuple[Episode, ...] = ()
+    """The steps of each episode, where they were asked for."""
 
     @property
     def mean(self) -> float:
@@ -95,6 +98,8 @@ def evaluate(
     seed: int,
     episodes: int | None = None,
     noise: float = 0.0,
+    stream: Stream = Stream.EVALUATE,
+    keep: bool = False,
 ) -> Evaluation:
     """So many episodes, by default one in each of `environments`, as many at once as there are of these.
 
@@ -103,22 +108,23 @@ def evaluate(
     episodes are played all at once or one by one.
 
     Episode `i` starts from a seed that depends on `seed` and `i` alone, so every evaluation of a run meets the same starts.
-    So does the `noise` of its actions: Gaussian with this standard deviation, after which they are clipped to [-1, 1].
+    So does the `noise` of its actions: Gaussian with this standard deviation, after which they are clipped to [-1, 1]. Another
+    `stream` gives other starts, and `keep` keeps the steps.
     """
     begin = time.perf_counter()
     checked = [envs.checked(env) for env in environments]
     episodes = len(checked) if episodes is None else episodes
-    returns, lengths, infos = np.zeros(episodes), np.zeros(episodes, np.int64), []
+    returns, lengths, infos, kept = np.zeros(episodes), np.zeros(episodes, np.int64), [], []
     size = max(LOCKSTEP, len(checked))
     for first in range(0, episodes, size):
         block = range(first, min(first + size, episodes))
         for start in range(first, block.stop, len(checked)):
             numbers = range(start, min(start + len(checked), block.stop))
             rows, part = np.zeros((len(block), envs.spec(checked[0]).obs_dim), np.float32), slice(start - first, None)
-            starts = [episode_seed(seed, Stream.EVALUATE, i) for i in numbers]
+            starts = [episode_seed(seed, stream, i) for i in numbers]
             names = [f"evaluation episode {i + 1}" for i in numbers]
             rollout, rngs = (
-                Rollout(checked[: len(numbers)], starts, names, keep=False),
+                Rollout(checked[: len(numbers)], starts, names, keep=keep),
                 [rng(seed, Stream.NOISE, i) for i in numbers],
             )
             while rollout.playing:
@@ -131,7 +137,8 @@ def evaluate(
                 rollout.step(actions)
             returns[start : numbers.stop], lengths[start : numbers.stop] = rollout.returns, rollout.lengths
             infos += map(_scalars, rollout.info)
-    return Evaluation(returns, lengths, time.perf_counter() - begin, _columns(infos))
+            kept += rollout.episodes() if keep else []
+    return Evaluation(returns, lengths, time.perf_counter() - begin, _columns(infos), tuple(kept))
 
 
 def _scalars(info: dict[str, Any]) -> dict[str, float]:

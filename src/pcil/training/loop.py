@@ -63,6 +63,8 @@ def train_loop(
         while state.counters.final_return is None:
             with states.saved_on_failure(run, folder, state, log, clock) as refuse_divergence:
                 if state.counters.frames >= min(state.counters.evaluations * run.evaluate_every, run.frames):
+                    if run.keep_best:
+                        states.keep_better(run, state, evaluation)
                     result = evaluate(state.policy(run), evaluation, seed=run.seed, episodes=run.evaluate_episodes)
                     told.evaluation(state.counters.frames, clock.total(), result)
                     state.counters = states.evaluated(run, state.counters, result.mean, demos_return)

@@ -18,9 +18,10 @@ from pcil import envs
 from pcil.agents import Actor
 from pcil.errors import InputError, RunError
 from pcil.policy import Policy, as_saved, load_policy
-from pcil.training import checkpoint, learner
+from pcil.training import checkpoint, kept, learner
 from pcil.training.callbacks import LOGS, Callback, LogFiles
 from pcil.training.config import Run
+from pcil.training.kept import Kept
 from pcil.training.learner import Learner, on_host
 from pcil.training.replay import Replay
 from pcil.types import Batch, Episode, Spec
@@ -85,9 +86,17 @@ class State:
     expert: Replay | None
     """The demonstrations; a checkpoint does not hold them."""
     counters: Counters
+    kept: Kept | None = None
+    """The policy that was evaluated last, if the run keeps the best."""
+    before: Kept | None = None
+    """The one before it, where the last evaluation was only due because the run ended."""
 
     def saved_actor(self, run: Run) -> Actor:
         """The actor that is evaluated and saved, with its arrays on the host."""
+        return self.kept.actor if self.kept else self.new_actor(run)
+
+    def new_actor(self, run: Run) -> Actor:
+        """The actor that the last update left, or its average."""
         return on_host(run.agent.averaged(self.learner.agent) or self.actor)
 
     def policy(self, run: Run) -> Callable[[np.ndarray], np.ndarray]:
@@ -120,6 +129,16 @@ def absorbed(run: Run, episode: Episode) -> Episode:
     return episode.absorbed(max(run.agent.n_step, len(episode))) if run.agent.absorbing else episode
 
 
+def keep_better(run: Run, state: State, environments: Sequence[envs.Checked]) -> None:
+    """Keep the policy of now, if the present reward pays it at least as much as the one kept before."""
+    actor = state.new_actor(run)
+    episodes = kept.played(actor, environments, seed=run.seed, episodes=run.evaluate_episodes)
+    now = Kept(actor, tuple(absorbed(run, episode) for episode in episodes))
+    due = state.counters.frames >= state.counters.evaluations * run.evaluate_every
+    state.before = None if due else state.kept
+    state.kept = kept.better(run.learner, state.learner, now, state.kept, state.counters.episodes)
+
+
 def evaluated(run: Run, counters: Counters, return_mean: float, demos_return: float | None) -> Counters:
     """The counters after an evaluation. It is the last one if the run has all its frames, or if two evaluations in a row have
     reached the share `run.until` of the demonstrations' mean return.
@@ -149,6 +168,7 @@ def save(folder: Path, state: State, logs: dict[str, str], clock: Clock, *, keep
     counters = replace(state.counters, seconds=clock.total())
     arrays = checkpoint.flatten("learner", state.learner)
     arrays |= checkpoint.flatten("actor", state.actor)  # made again from the learner it may differ in the last bit
+    arrays |= kept.flatten("kept", state.kept) | kept.flatten("before", state.before)
     if keep_replay and state.replay.num_episodes:
         arrays |= {f"replay.{name}": array for name, array in state.replay.state().items()}
     checkpoint.save(folder / "checkpoint", counters.frames, arrays, {"counters": asdict(counters), "logs": logs})
@@ -172,6 +192,7 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
         restored = checkpoint.unflatten("learner", fresh.learner, arrays)
         known = checkpoint.flatten("actor", fresh.actor).keys() <= arrays.keys()  # older ones have no scale of observations
         actor = checkpoint.unflatten("actor", fresh.actor, arrays) if known else run.agent.actor(restored.agent)
+        best, before = (kept.unflatten(name, fresh.actor, arrays) for name in ("kept", "before"))
         counters = Counters.of(meta)
     except (ValueError, TypeError) as error:
         raise InputError(
@@ -184,11 +205,12 @@ def resume(run: Run, folder: Path, fresh: State, told: Callback) -> tuple[State,
         too_many = counters.frames < (counters.evaluations - 1) * run.evaluate_every  # older versions counted one not due
         counters = replace(counters, final_return=None, evaluations=counters.evaluations - too_many)
         logs["eval.csv"] = _first_evaluations(logs["eval.csv"], counters.evaluations)
+        best, before = before or best, None
     if counters.final_return is None:
         if held := {name[7:]: array for name, array in arrays.items() if name.startswith("replay.")}:
             fresh.replay.load(held)
         told.message(f"Resuming at {counters.frames:,} of {run.frames:,} frames.")
-    return State(restored, actor, fresh.replay, fresh.expert, counters), logs
+    return State(restored, actor, fresh.replay, fresh.expert, counters, best, before), logs
 
 
 def save_policy(run: Run, folder: Path, state: State, env: envs.Checked, return_mean: float, returns: Sequence[float]) -> None:

@@ -97,7 +97,7 @@ def run(name: str, task: str, seed: int, minutes: float) -> list[EvalRow]:
         request = {"competitor": name, "task": task, "seed": seed, "minutes": minutes, "starts": starts}
         request |= {"demos": f"{place}/demos.npz", "out": f"{place}/run"}
         errors, pipe = Path(place) / "errors.txt", subprocess.PIPE
-        command, source = python(COMPETITORS[name]), commit() or ""
+        command, source = python(COMPETITORS[name]), commit(ROOT / "experiments") or ""
         with (
             errors.open("w") as said,
             subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said, text=True, env=one_core(), cwd=place) as child,

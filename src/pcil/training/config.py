@@ -98,7 +98,8 @@ class Run:
     """Episodes per evaluation."""
     keep_best: bool = False
     """Evaluate and save, of the policy of now and the one saved before, the one that the present reward pays more, in as many
-    episodes as an evaluation has, from other starts. The environment's own reward has no part in it."""
+    episodes as an evaluation has, from other starts. The environment's own reward has no part in it, unless the method is given
+    that reward."""
     checkpoint_seconds: float = 120.0
     """Minimum time between two checkpoints, in seconds; checkpoints are written between episodes and when the run stops."""
     keep_replay: bool = True

@@ -299,8 +299,9 @@ def _completed(settings: dict[str, Any], run: Run) -> dict[str, Any]:
         return renamed(flat(settings))
 
 
-def commit() -> str | None:
-    """The commit of the source tree that is running, with "+" where files differ from it; None outside a repository."""
+def commit(*more: Path) -> str | None:
+    """The commit of the source tree that is running, with "+" where its files, or those of `more`, differ from it; None outside
+    a repository."""
     here = Path(__file__).parent.parent
 
     def git(*words: str) -> str:
@@ -309,7 +310,7 @@ def commit() -> str | None:
     try:
         if not git("ls-files", "__init__.py"):
             return None
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", ".") else "")
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", ".", *map(str, more)) else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 

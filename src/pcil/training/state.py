@@ -134,8 +134,7 @@ def keep_better(run: Run, state: State, environments: Sequence[envs.Checked]) ->
     actor = state.new_actor(run)
     episodes = kept.played(actor, environments, seed=run.seed, episodes=run.evaluate_episodes)
     now = Kept(actor, tuple(absorbed(run, episode) for episode in episodes))
-    due = state.counters.frames >= state.counters.evaluations * run.evaluate_every
-    state.before = None if due else state.kept
+    state.before = None if _due(run, state.counters) else state.kept
     state.kept = kept.better(run.learner, state.learner, now, state.kept, state.counters.episodes)
 
 
@@ -145,13 +144,17 @@ def evaluated(run: Run, counters: Counters, return_mean: float, demos_return: fl
 
     An evaluation that is only due because the run ends is not counted, so that the run can go on from here with more frames.
     """
-    due = counters.frames >= counters.evaluations * run.evaluate_every
     good = run.until is not None and demos_return is not None and return_mean >= run.until * demos_return
-    if due:
+    if _due(run, counters):
         number = counters.good_evaluations + 1 if good else 0
         counters = replace(counters, evaluations=counters.evaluations + 1, good_evaluations=number)
     last = counters.frames >= run.frames or _good_enough(run, counters)
     return replace(counters, final_return=return_mean if last else None)
+
+
+def _due(run: Run, counters: Counters) -> bool:
+    """Whether an evaluation is due, also if the run does not end here."""
+    return counters.frames >= counters.evaluations * run.evaluate_every
 
 
 def _good_enough(run: Run, counters: Counters) -> bool:

@@ -37,6 +37,7 @@ def test_the_streams_numbers_stay_what_they_were() -> None:
         "RECORD": 8,
         "CLONE": 9,
         "NOISE": 10,
+        "SELECT": 11,
     }
 
 

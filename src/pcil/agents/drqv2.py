@@ -63,9 +63,9 @@ class DrQV2(Agent):
     cloning: bool | None = False
     """Train the actor by behavioural cloning as well, before the first update and in every update. None: if the demonstrations
     have actions. The statistics of observations are then those of the demonstrations and the agent together."""
-    cloning_weight: LinearSchedule = field(default_factory=lambda: LinearSchedule(10.0, 10.0, 30_000))
-    """Schedule of the weight of the squared error of the cloned actions, over agent steps, relative to values of mean absolute
-    value 1, if `cloning`."""
+    cloning_weight: LinearSchedule = field(default_factory=lambda: LinearSchedule(30.0, 30.0, 30_000))
+    """Schedule of the weight of the squared error of the cloned actions, over agent steps, if `cloning`; relative to values
+    whose slope in the actions has a root mean square of 1."""
     averaging_rate: float = 1.0
     """Rate, per update, at which an average of the actor's parameters follows the actor. The average is evaluated and saved,
     and the actor itself explores and learns. 1: there is no average."""
@@ -114,6 +114,25 @@ class DrQV2(Agent):
         first, second = critic(obs, add_noise(actor(obs), noise))
         return -jnp.mean(alive * jnp.minimum(first, second))
 
+    def unit_actor_loss(
+        self,
+        actor: Actor,
+        critic: Critic,
+        obs: Float[Array, "batch obs"],
+        noise: Float[Array, "batch action"],
+        alive: Float[Array, " batch"],
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """A loss with the gradient of `actor_loss`, divided by the root mean square of the value's slope in the actions, and
+        `actor_loss`. The slope's length is what an action gains, whatever the size of the values."""
+        action = add_noise(actor(obs), noise)
+
+        def value(action: Float[Array, "batch action"]) -> Float[Array, ""]:
+            return jnp.sum(alive * jnp.minimum(*critic(obs, action)))
+
+        total, slope = jax.value_and_grad(value)(jax.lax.stop_gradient(action))
+        size = jnp.sqrt(jnp.mean(jnp.sum(slope**2, axis=-1))) + 1e-6
+        return -jnp.mean(jnp.sum(slope * action, axis=-1)) / size, -total / len(obs)
+
     def cloning_error(self, state: DrQV2State, actor: Actor, cloned: Window) -> Float[Array, ""]:
         """The squared error of the actor's mean actions in states of the demonstrations, summed over the action's entries and
         averaged over the windows that do not begin in the absorbing state."""
@@ -154,12 +173,12 @@ class DrQV2(Agent):
         critic, critic_opt_state = adam_step(state.critic, gradient, state.critic_opt_state, self.learning_rate)
 
         def loss_of(actor: Actor) -> tuple[Float[Array, ""], Metrics]:
-            loss = self.actor_loss(actor, critic, obs, noise[1], alive)
             if cloned is None:
+                loss = self.actor_loss(actor, critic, obs, noise[1], alive)
                 return loss, {"actor_loss": loss}
             error = self.cloning_error(state, actor, cloned)
-            size = jnp.mean(jnp.abs(target)) + 1e-3
-            return loss / size + self.cloning_weight(step) * error, {"actor_loss": loss, "cloning_error": error}
+            move, loss = self.unit_actor_loss(actor, critic, obs, noise[1], alive)
+            return move + self.cloning_weight(step) * error, {"actor_loss": loss, "cloning_error": error}
 
         gradient, more = jax.grad(loss_of, has_aux=True)(state.actor)
         actor, actor_opt_state = adam_step(state.actor, gradient, state.actor_opt_state, self.learning_rate)

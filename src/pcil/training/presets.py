@@ -60,6 +60,7 @@ def default(task: str) -> dict[str, Any]:
     return {
         **paper(task),
         "frames": 500_000,  # ours
+        "keep_best": True,  # ours: falls at the moment of an evaluation
         "label": "sampled",  # ours: stored rewards are stale
         "random_frames": 2000,  # ours
         "agent.n_step": 1,  # ours
@@ -72,8 +73,9 @@ def default(task: str) -> dict[str, Any]:
 
 
 def reward_only(task: str) -> dict[str, Any]:
-    """`default` with an agent that learns from its reward alone, to compare rewards: it neither clones nor is averaged."""
-    return {**default(task), "agent.cloning": False, "agent.averaging_rate": 1.0}
+    """`default` with an agent that learns from its reward alone, to compare rewards: it neither clones nor is averaged, and the
+    policy of the moment is evaluated."""
+    return {**default(task), "keep_best": False, "agent.cloning": False, "agent.averaging_rate": 1.0}
 
 
 PRESETS: dict[str, Callable[[str], dict[str, Any]]] = {

@@ -90,6 +90,7 @@ BC_SETTINGS: dict[str, Any] = {
     "seed_frames": 0,  # nothing is played
     "random_frames": 0,  # nothing is played
     "update_every": 1,  # authors' train_bc.py
+    "keep_best": False,  # nothing pays a policy
     "reward": "expert",  # none is used
     "reward.task_weight": 0.0,  # none is used
     "agent": "bc",

@@ -55,8 +55,8 @@ def register(**wrong: Any) -> None:
 
 
 def odd_run(method: str = "expert", **changes: Any) -> Run:
-    """Episodes of ten steps; updates start in the third one."""
-    settings = {"frames": 60, "seed_frames": 20, "random_frames": 20, "evaluate_every": 30}
+    """Episodes of ten steps; updates start in the third one. Only training and evaluations play episodes."""
+    settings = {"frames": 60, "seed_frames": 20, "random_frames": 20, "evaluate_every": 30, "keep_best": False}
     return small_run(method, ID, **{**settings, **changes})
 
 

@@ -1,7 +1,8 @@
 """Evaluate the policies of finished runs on 100 starts each: python experiments/starts.py FOLDER ...
 
 A run's own evaluations have ten episodes, so a start in a hundred that fails is mostly unseen. The rows go to
-`results/starts.json`; those of other runs are kept, and a run that is there with the same frames is not evaluated again.
+`results/starts.json`; those of other runs are kept, and a run that is there with the same frames and commit is not evaluated
+again.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ def main(*folders: str) -> None:
     for folder in finished(folders):
         run = settings(folder)
         name = run["task"], run["method"], variant(run), run["seed"], run["frames"]
-        if name not in rows:
-            rows[name] = dict(zip(NAME, name, strict=True)) | returns(folder, run["task"])
+        commit = json.loads((folder / "run.json").read_text())["commit"]
+        if rows.get(name, {}).get("commit") != commit:
+            rows[name] = dict(zip(NAME, name, strict=True)) | returns(folder, run["task"]) | {"commit": commit}
             print(
                 *name, f"{rows[name]['mean']:.1f}, worst {rows[name]['worst']:.1f}, failing {rows[name]['failing']}", flush=True
             )

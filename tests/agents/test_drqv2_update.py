@@ -150,13 +150,13 @@ def test_three_updates_equal_the_definitions_in_float64(cloning: bool) -> None:
 
 def test_a_value_without_slope_moves_nothing_but_the_clone() -> None:
     """With a critic that is constant in the actions, the actor's gradient is that of the cloning error alone."""
-    agent = dataclasses.replace(AGENT, cloning=True)
+    agent = dataclasses.replace(AGENT, cloning=True, cloning_weight=LinearSchedule(7.0, 7.0, 1))
     state, key, cloned = agent.init(SPEC, key=jax.random.key(0)), jax.random.key(1), window(9)
     agent = dataclasses.replace(agent, learning_rate=0.0)
     flat = jax.tree.map(jnp.zeros_like, state.critic)
     state = dataclasses.replace(state, critic=flat, critic_target=flat)
     after, metrics = agent.update(state, window(0), cloned=cloned, step=jnp.int32(0), key=key)
-    slopes = jax.tree.leaves(jax.grad(lambda actor: 10 * agent.cloning_error(state, actor, cloned))(state.actor))
+    slopes = jax.tree.leaves(jax.grad(lambda actor: 7 * agent.cloning_error(state, actor, cloned))(state.actor))
     assert float(metrics["actor_loss"]) == 0
     for got, slope in zip(jax.tree.leaves(after.actor_opt_state[0].mu), slopes, strict=True):
         assert np.allclose(got, 0.1 * slope, rtol=1e-4, atol=1e-7)

@@ -23,7 +23,7 @@ def main(*words: str) -> None:
     if len(words) < 2:
         raise InputError("Give the CSV file, and one or more folders with runs.")
     target, *folders = words
-    rows = [row for folder in finished(folders) for row in read_run(folder, variant(settings(folder)))]
+    rows = [row for folder in finished(folders) for row in read_run(folder, variant(described(folder)["run"]))]
     new = {row[:4] for row in rows}
     kept = [row for row in read_rows(Path(target)) if row[:4] not in new] if Path(target).exists() else []
     write_rows(Path(target), sorted(kept + rows, key=sort_key))
@@ -34,9 +34,10 @@ def finished(folders: Iterable[str]) -> list[Path]:
     return sorted({done.parent for top in folders for done in Path(top).rglob("DONE")})
 
 
-def settings(folder: Path) -> dict[str, Any]:
-    """A run's settings, by their present names."""
-    return renamed(json.loads((folder / "run.json").read_text())["run"])
+def described(folder: Path) -> dict[str, Any]:
+    """A run's `run.json`, with the settings in `run` by their present names."""
+    about = json.loads((folder / "run.json").read_text())
+    return about | {"run": renamed(about["run"])}
 
 
 def variant(run: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import cost
 import race
 import starts
 
@@ -71,7 +72,7 @@ def demos_table() -> str:
     return tables.markdown(tables.Table(header, rows))
 
 
-MAKERS = {**tables.MAKERS, "race": race.table}
+MAKERS = {**tables.MAKERS, "race": race.table, "savings": cost.savings}
 PLAIN = {
     "demos": demos_table,
     "race-costs": lambda: tables.markdown(race.costs_table()),

@@ -23,13 +23,13 @@ NAME = ("task", "method", "variant", "seed", "frames")
 
 def main(*folders: str) -> None:
     """Evaluate what is new."""
-    from collect import finished, settings, variant  # with JAX, which the table does without
+    from collect import described, finished, variant  # with JAX, which the table does without
 
     rows = {tuple(row[name] for name in NAME): row for row in (json.loads(ROWS.read_text()) if ROWS.exists() else [])}
     for folder in finished(folders):
-        run = settings(folder)
+        about = described(folder)
+        run, commit = about["run"], about["commit"]
         name = run["task"], run["method"], variant(run), run["seed"], run["frames"]
-        commit = json.loads((folder / "run.json").read_text())["commit"]
         if rows.get(name, {}).get("commit") != commit:
             rows[name] = dict(zip(NAME, name, strict=True)) | returns(folder, run["task"]) | {"commit": commit}
             print(
